@@ -1,0 +1,9 @@
+"""Rigid bodies as a grid sees them: where they are, how they resist, and what contact with grains does to both.
+
+Knows MuJoCo and MJX, no grains: it is handed points with a mass and a velocity, grid nodes or grains alike.
+
+    geoms      signed distance of each MuJoCo geom
+    bodies     which geoms couple, where they are over one rigid step, and the rigid step itself
+    contact    points against geoms: distance, normal, and the law of separation, sticking and sliding
+    exchange   the impulses between points and bodies, solved together with the joint-space mass matrix
+"""

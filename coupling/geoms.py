@@ -1,0 +1,326 @@
+"""How far a point is from a MuJoCo geom: signed distance in metres, negative inside, in the geom's own frame.
+
+Primitive shapes have exact distances, one function each in `GEOM_SDF`. A mesh, concave or not, is turned once
+into a grid of distances (voxels), kept on disk and sampled linearly. MuJoCo itself collides a mesh as its
+convex hull, so a concave tool that must also touch rigid bodies is better built from boxes.
+
+To add a primitive: write its distance for one point, then add one line to `GEOM_SDF` and one to `BOUNDS`.
+"""
+
+import functools
+import hashlib
+import math
+import os
+import tempfile
+import warnings
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jax import Array
+from jax.scipy.ndimage import map_coordinates
+
+MESH = int(mujoco.mjtGeom.mjGEOM_MESH)
+
+TINY_SQUARE = 1e-30
+"""Squared lengths below this count as zero: 1e-15 m is no distance here, and its square fits float32."""
+NUDGE = 1e-9
+"""An ellipsoid's point stays this share of the shortest half axis off each mid plane, where the nearest point
+of the surface is not unique. It moves that by as little."""
+HALVINGS = 10
+"""Brackets up to e^32 wide (`NUDGE`, and points 1e5 half axes away) shrink to e^(32 / 2^10) = 1.03."""
+NEWTON_STEPS = 4
+"""From 3 % off, an error e becomes 1.5 e^2 each step: 1e-3, 3e-6, 1e-11, below float64's digits."""
+MARGIN = 2
+"""Voxels between a mesh and the edge of its grid, so that gradients just outside are sampled, not clamped."""
+CELLS = (8, 256)
+"""Fewest and most voxels along a grid: below, the margin eats it; above, it takes over 64 MB."""
+FLAT_GRADIENT = 1e-6
+"""A squared gradient below this has no direction left: exact distances have 1, voxels 0 on ridges inside."""
+
+
+@dataclass(frozen=True, eq=False)
+class Voxels:
+    """Signed distances to a mesh at the nodes of a grid of cubes, in the geom's frame."""
+
+    values: np.ndarray  # (nx, ny, nz) m, float32
+    origin: np.ndarray  # (3,) m, place of values[0, 0, 0]
+    spacing: float  # m
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """What a coupled geom is, apart from where it is. Equal only to itself."""
+
+    kind: int  # a key of GEOM_SDF, or MESH
+    size: tuple[float, float, float]  # m, as in `model.geom_size`; a mesh does not use it
+    voxels: Voxels | None = None  # meshes only
+
+
+def length(v: Array) -> Array:
+    """Euclidean length () whose gradient is a unit vector even at zero (there: along the first axis).
+
+    The first axis is at right angles to every geom's axis of symmetry, z, so it is a true normal there too.
+    """
+    square = jnp.sum(v * v)
+    far = square > TINY_SQUARE
+    return jnp.where(far, jnp.sqrt(jnp.where(far, square, 1)), v[0])
+
+
+def magnitude(v: Array) -> Array:
+    """|v|, with gradient 1 rather than 0 at zero."""
+    return jnp.where(v < 0, -v, v)
+
+
+def corner(q: Array) -> Array:
+    """Signed distance () to the region where all of q <= 0: boxes and cylinders, seen from one corner."""
+    # Not jnp.max, which shares the gradient among equals and so shortens it.
+    nearest = functools.reduce(lambda a, b: jnp.where(b > a, b, a), q)
+    return jnp.where(nearest > 0, length(jnp.maximum(q, 0)), nearest)
+
+
+def plane(size: Array, p: Array) -> Array:
+    """Height over the half space z <= 0. It has no edge: MuJoCo's plane size is for drawing only."""
+    return p[2]
+
+
+def sphere(size: Array, p: Array) -> Array:
+    """Sphere of radius size[0]."""
+    return length(p) - size[0]
+
+
+def capsule(size: Array, p: Array) -> Array:
+    """Capsule of radius size[0] around the segment |z| <= size[1]."""
+    return length(p.at[2].add(-jnp.clip(p[2], -size[1], size[1]))) - size[0]
+
+
+def cylinder(size: Array, p: Array) -> Array:
+    """Cylinder of radius size[0] and half height size[1], along z."""
+    return corner(jnp.stack([length(p[:2]) - size[0], magnitude(p[2]) - size[1]]))
+
+
+def box(size: Array, p: Array) -> Array:
+    """Box of half sides size."""
+    return corner(magnitude(p) - size)
+
+
+def ellipsoid(size: Array, p: Array) -> Array:
+    """Ellipsoid of half axes r = size.
+
+    The nearest surface point is x_i = r_i u_i with u_i = r_i p_i / (t + r_i^2), t the largest root of |u| = 1
+    (D. Eberly, Distance from a Point to an Ellipse, an Ellipsoid, or a Hyperellipsoid). We solve for
+    s = t + min(r)^2, which keeps float32's digits deep inside, and return n . (p - x), n the normal at x: its
+    error is second order in that of x. Gradients by p and by size are exact; second derivatives are left out.
+    """
+    r, a = jax.lax.stop_gradient((size, magnitude(p)))
+    r_min = jnp.min(r)
+    rp = r * jnp.maximum(a, NUDGE * r_min)
+    gap = (r - r_min) * (r + r_min)
+
+    low, high = jnp.max(rp - gap), jnp.linalg.norm(rp)  # not 0, by NUDGE; |u| >= 1 at low, <= 1 at high
+    for _ in range(HALVINGS):
+        middle = jnp.sqrt(low * high)
+        below = jnp.sum((rp / (middle + gap)) ** 2) > 1
+        low, high = jnp.where(below, middle, low), jnp.where(below, high, middle)
+    s = low  # |u|^2 falls and is convex, so Newton from below never oversteps
+    for _ in range(NEWTON_STEPS):
+        u_square = (rp / (s + gap)) ** 2
+        s = s + (jnp.sum(u_square) - 1) / jnp.sum(2 * u_square / (s + gap))
+
+    u = jnp.where(p < 0, -1, 1) * rp / (s + gap)
+    u = jax.lax.stop_gradient(u / length(u))
+    n = jax.lax.stop_gradient(u / r / length(u / r))
+    return jnp.sum(n * (p - size * u))
+
+
+def mesh(voxels: Voxels, p: Array) -> Array:
+    """Mesh, sampled linearly from its voxels.
+
+    Off by a small part of a voxel at flat places, by up to half of one at sharp edges; walls need two voxels.
+    Outside the grid: the distance to the grid's nearest point plus the value there, which is continuous and,
+    but for that error, never below the true distance.
+    """
+    values = jnp.asarray(voxels.values, p.dtype)
+    origin = jnp.asarray(voxels.origin, p.dtype)
+    at = jnp.clip(p, origin, origin + voxels.spacing * (np.array(values.shape, p.dtype) - 1))
+    sampled = map_coordinates(values, list((at - origin) / voxels.spacing), order=1, mode="nearest")
+    return sampled + length(p - at)
+
+
+GEOM_SDF: dict[int, Callable[[Array, Array], Array]] = {
+    int(mujoco.mjtGeom.mjGEOM_PLANE): plane,
+    int(mujoco.mjtGeom.mjGEOM_SPHERE): sphere,
+    int(mujoco.mjtGeom.mjGEOM_CAPSULE): capsule,
+    int(mujoco.mjtGeom.mjGEOM_ELLIPSOID): ellipsoid,
+    int(mujoco.mjtGeom.mjGEOM_CYLINDER): cylinder,
+    int(mujoco.mjtGeom.mjGEOM_BOX): box,
+}
+"""Signed distance () m of one point p (3,) from a primitive of MuJoCo's size (3,), in the geom's frame."""
+
+BOUNDS: dict[int, Callable[[float, float, float], tuple[tuple[float, float, float], float]]] = {
+    int(mujoco.mjtGeom.mjGEOM_PLANE): lambda a, b, c: ((math.inf, math.inf, math.inf), math.inf),
+    int(mujoco.mjtGeom.mjGEOM_SPHERE): lambda a, b, c: ((a, a, a), a),
+    int(mujoco.mjtGeom.mjGEOM_CAPSULE): lambda a, b, c: ((a, a, a + b), a + b),
+    int(mujoco.mjtGeom.mjGEOM_ELLIPSOID): lambda a, b, c: ((a, b, c), max(a, b, c)),
+    int(mujoco.mjtGeom.mjGEOM_CYLINDER): lambda a, b, c: ((a, a, b), math.hypot(a, b)),
+    int(mujoco.mjtGeom.mjGEOM_BOX): lambda a, b, c: ((a, b, c), math.hypot(a, b, c)),
+}
+"""Half sides of a primitive's bounding box and radius of its bounding sphere, m, from MuJoCo's size."""
+
+
+def distance(shape: Shape, p: Array) -> Array:
+    """Signed distance () m of one point p (3,) m of the geom's frame; negative inside. In p's precision."""
+    if shape.voxels is not None:
+        return mesh(shape.voxels, p)
+    return GEOM_SDF[shape.kind](jnp.asarray(shape.size, p.dtype), p)
+
+
+def distance_and_normal(shape: Shape, p: Array) -> tuple[Array, Array]:
+    """Signed distance () m of one point p (3,) m and the outward unit normal (3,), in the geom's frame.
+
+    The normal is that of the nearest surface point, inside too, or of one of several equally near. On ridges
+    inside a mesh it may be any unit vector.
+    """
+    phi, gradient = jax.value_and_grad(functools.partial(distance, shape))(p)
+    steep = jnp.sum(gradient * gradient) > FLAT_GRADIENT
+    gradient = jnp.where(steep, gradient, jnp.array([1, 0, 0], p.dtype))
+    return phi, gradient / length(gradient)
+
+
+def half_extents(shape: Shape) -> np.ndarray:
+    """Half sides (3,) m of the bounding box about `centre`, along the geom's axes; infinite for a plane."""
+    if shape.voxels is not None:
+        low, high = _inside(shape.voxels)
+        return (high - low) / 2
+    return np.array(BOUNDS[shape.kind](*shape.size)[0])
+
+
+def centre(shape: Shape) -> np.ndarray:
+    """Centre (3,) m of the bounding box in the geom's frame: the frame's origin, but for meshes."""
+    if shape.voxels is not None:
+        low, high = _inside(shape.voxels)
+        return (high + low) / 2
+    return np.zeros(3)
+
+
+def bounding_radius(shape: Shape) -> float:
+    """Radius, m, of a sphere about the geom frame's origin that holds the geom; infinite for a plane."""
+    if shape.voxels is not None:
+        return float(np.linalg.norm(np.abs(centre(shape)) + half_extents(shape)))
+    return BOUNDS[shape.kind](*shape.size)[1]
+
+
+def _inside(voxels: Voxels) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper corner (3,) m of a box that holds the mesh: all negative nodes, and a voxel around."""
+    nodes = np.argwhere(voxels.values < 0)
+    return (
+        voxels.origin + voxels.spacing * (nodes.min(axis=0) - 1),
+        voxels.origin + voxels.spacing * (nodes.max(axis=0) + 1),
+    )
+
+
+def shape_of(model: mujoco.MjModel, geom: int, *, cells: int = 64, cache_dir: Path | None = None) -> Shape:
+    """The shape of a MuJoCo geom; a mesh is cut into `cells` voxels along its longest side.
+
+    Meshes take about half a second at 64 cells, once: distances are kept in `cache_dir`, by default
+    `mpm_env/sdf` in `$XDG_CACHE_HOME` or `~/.cache`.
+
+    Raises ValueError for an unknown geom, a geom type without a distance, a mesh that encloses no voxel node,
+    and `cells` outside `CELLS`.
+    """
+    if not 0 <= geom < model.ngeom:
+        raise ValueError(f"geom = {geom} is not in this model: use an id in 0..{model.ngeom - 1}.")
+    name = model.geom(geom).name or f"number {geom}"
+    kind = int(model.geom_type[geom])
+    a, b, c = (float(s) for s in model.geom_size[geom])
+    if kind in GEOM_SDF:
+        return Shape(kind, (a, b, c))
+    if kind != MESH:
+        supported = ", ".join(_type_name(k) for k in [*GEOM_SDF, MESH])
+        raise ValueError(
+            f"geom {name} is of type {_type_name(kind)}, which cannot touch grains; "
+            f"supported are {supported}: replace it by those or leave it out of the coupling."
+        )
+    return Shape(kind, (a, b, c), _voxels_of(model, geom, name, cells, cache_dir or _default_cache()))
+
+
+def _type_name(kind: int) -> str:
+    return mujoco.mjtGeom(kind).name.removeprefix("mjGEOM_").lower()
+
+
+def _default_cache() -> Path:
+    # An empty XDG_CACHE_HOME counts as not set (XDG Base Directory Specification).
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mpm_env" / "sdf"
+
+
+def _voxels_of(model: mujoco.MjModel, geom: int, name: str, cells: int, cache_dir: Path) -> Voxels:
+    """The voxels of a mesh geom: read from the cache, else computed and kept."""
+    if not CELLS[0] <= cells <= CELLS[1]:
+        raise ValueError(f"cells = {cells} for the mesh of geom {name} is outside {CELLS[0]}..{CELLS[1]}.")
+    data = int(model.geom_dataid[geom])
+    if data < 0 or model.mesh_facenum[data] == 0:
+        raise ValueError(f"geom {name} has a mesh without faces: give it faces, or use a primitive geom.")
+    first, count = model.mesh_vertadr[data], model.mesh_vertnum[data]
+    vertices = np.asarray(model.mesh_vert[first : first + count], np.float64)
+    first, count = model.mesh_faceadr[data], model.mesh_facenum[data]
+    faces = np.asarray(model.mesh_face[first : first + count], np.int64)
+
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    spacing = float((high - low).max()) / (cells - 2 * MARGIN)
+    nodes = np.ceil((high - low) / spacing).astype(int) + 2 * MARGIN + 1
+    origin = (low + high - spacing * (nodes - 1)) / 2
+
+    recipe = repr((vertices.shape, faces.shape, cells, MARGIN)).encode()
+    digest = hashlib.sha256(recipe + vertices.tobytes() + faces.tobytes()).hexdigest()
+    file = cache_dir / f"{digest}.npz"
+    values = _read(file, tuple(nodes))
+    if values is None:
+        places = origin + spacing * np.stack(np.meshgrid(*map(np.arange, nodes), indexing="ij"), axis=-1)
+        values = _mesh_distances(places.reshape(-1, 3), vertices, faces).reshape(nodes)
+        _write(file, values)
+    if not (values < 0).any():
+        raise ValueError(
+            f"the mesh of geom {name} encloses none of its voxels of {spacing:.3g} m: it must be closed, "
+            f"with faces turned outward and walls of two voxels; use cells > {cells}, or build it from boxes."
+        )
+    return Voxels(values, origin, spacing)
+
+
+def _mesh_distances(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Signed distances (n,) m, float32, of points (n, 3) m to a mesh, negative where it winds around.
+
+    Winding numbers get the sign right for concave meshes, and at edges (libigl; Barill et al. 2018, Fast
+    Winding Numbers for Soups and Clouds).
+    """
+    import igl  # a compiled library that only scenes with meshes need
+
+    winding = igl.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER
+    signed, _, nearest, _ = igl.signed_distance(points, vertices, faces, winding)
+    # Only its sign is good: libigl multiplies the distance by 1 - 2 w, w the approximate winding number.
+    return np.copysign(np.linalg.norm(points - nearest, axis=1), signed).astype(np.float32)
+
+
+def _read(file: Path, shape: tuple[int, ...]) -> np.ndarray | None:
+    """Kept distances, or None where there are none or the file is damaged (npz files hold a checksum)."""
+    try:
+        with file.open("rb") as opened, np.load(opened) as kept:
+            values = kept["values"]
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        return None
+    return values if values.shape == shape and values.dtype == np.float32 else None
+
+
+def _write(file: Path, values: np.ndarray) -> None:
+    """Keep distances for next time, whole or not at all: another process may use the same file now."""
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=file.parent) as private:
+            np.savez(Path(private) / file.name, values=values)
+            os.replace(Path(private) / file.name, file)
+    except OSError as error:
+        warnings.warn(f"mesh distances cannot be kept and are computed each time: {error}", stacklevel=2)

@@ -1,0 +1,38 @@
+"""How finely a scene is simulated: everything that trades speed for accuracy, and nothing physical."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from mpm_env.config import Section, find, parse, read_yaml
+
+Positive = Annotated[float, Field(gt=0)]
+
+
+class Fidelity(Section):
+    """Resolution, time step and numerics of a run."""
+
+    about: str = ""
+    dimension: Literal[2, 3] = Field(3, description="3, or 2 for the scene's middle slice in plane strain (x-z)")
+    cells: int = Field(6, ge=2, description="grid cells along the scene's feature length")
+    particles_per_axis: int = Field(2, ge=1, le=4, description="grains per cell along each axis, at the start")
+    courant: Positive = Field(0.5, description="sound speed times substep over cell size")
+    mpm_dt: Positive | None = Field(None, description="s; the substep, if not the longest that courant allows")
+    rigid_dt: Positive = Field(0.004, description="s; one MJX step, a whole number of substeps")
+    stiffness: Annotated[float, Field(gt=0, le=1)] = Field(
+        1.0, description="factor on Young's moduli: softer is faster"
+    )
+    precision: Literal["f32", "f64"] = "f32"
+    contact_band: Annotated[float, Field(ge=0, le=1)] = Field(0.5, description="cells off a body where nodes feel it")
+    contact_iterations: int = Field(4, ge=1, le=20, description="Newton iterations of the momentum exchange")
+    push_out: bool = Field(
+        True, description="grains inside a body are put back to its surface, so thin tools do not leak"
+    )
+
+
+def load_fidelity(name: str) -> Fidelity:
+    """A shipped fidelity by name, or one from a .yaml file."""
+    path = find("fidelities", name)
+    return parse(Fidelity, read_yaml(path), path.name)

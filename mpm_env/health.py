@@ -1,0 +1,46 @@
+"""How a simulation says that it is unwell: sticky bits, and a sentence for each."""
+
+from __future__ import annotations
+
+from enum import IntFlag
+
+MOST_DEPTH = 0.5  # cells a grain may stand inside a body before contact is called lost
+MOST_TRAVEL = 0.5  # cells a body may move in one rigid step: the points near it are looked up once per rigid step
+
+
+class Health(IntFlag):
+    """What has gone wrong since the state was made. 0 is well."""
+
+    WELL = 0
+    NOT_FINITE = 1
+    LEFT_GRID = 2
+    TOO_FAST = 4
+    INVERTED = 8
+    TOO_DEEP = 16
+    NODES_OVERFLOW = 32
+    GRAINS_OVERFLOW = 64
+    NOT_CONVERGED = 128
+    BODY_TOO_FAST = 256
+
+
+SENTENCES: dict[Health, str] = {
+    Health.NOT_FINITE: "A grain or a body has a value that is not finite: the run is lost from here on.",
+    Health.LEFT_GRID: "A grain went through a closed wall and left the grid: the time step is too long for its speed.",
+    Health.TOO_FAST: "A grain crossed more than half a cell in one substep: use a smaller courant or a lower speed.",
+    Health.INVERTED: "A grain's velocity gradient would turn it inside out in one substep: use a smaller courant.",
+    Health.TOO_DEEP: "A grain stands more than half a cell inside a body: the tool is too thin or too fast for the cells.",
+    Health.NODES_OVERFLOW: "More grid nodes are near bodies than were set aside: contact is incomplete.",
+    Health.GRAINS_OVERFLOW: "More grains are near bodies than were set aside: contact is incomplete.",
+    Health.NOT_CONVERGED: "Contact between grains and bodies was not solved: raise contact_iterations.",
+    Health.BODY_TOO_FAST: "A coupled body moved more than half a cell in one rigid step: use a smaller rigid_dt.",
+}
+
+
+def sentences(bits: int) -> list[str]:
+    """One sentence for each bit that is set."""
+    return [SENTENCES[bit] for bit in Health if bit and bit & bits]
+
+
+def names(bits: int) -> list[str]:
+    """The names of the bits that are set."""
+    return [bit.name or "" for bit in Health if bit and bit & bits]

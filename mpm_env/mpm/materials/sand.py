@@ -1,0 +1,88 @@
+"""Dry or cohesive sand."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import partial
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from mpm_env.mpm.linalg3 import TINY, compose, eigen
+from mpm_env.mpm.materials.protocol import LEAST_B, hencky_energy, lame, p_wave_speed
+
+LEAST_TAN = 1e-6  # keeps the tip of a frictionless cohesive cone at a finite (huge) tension
+VOLUME_CORRECTION_CAP = 0.1  # largest remembered dilation: beyond 10 % loose sand is spray, not a volume to restore
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=["E", "nu", "rho", "friction", "cohesion"],
+    meta_fields=["friction_fit", "volume_correction"],
+)
+@dataclass(frozen=True)
+class Sand:
+    """Drucker-Prager sand on Hencky elasticity (K16 sections 5 and 6, volume correction after T17).
+
+    Rate independent, perfectly plastic, not associated (flow on the cone keeps the volume). Remembers the volume gained
+    by separation, which later compression must close before it meets stress.
+
+    E Pa, nu, rho kg/m^3, friction rad (angle of internal friction), cohesion Pa. friction_fit says which test the angle
+    comes from, that is where the smooth cone touches Mohr-Coulomb: "triaxial" compression (K16), "plane_strain", or
+    "mc2d" (a purely two-dimensional cone: sin(phi) = stress ratio in the plane with the out-of-plane stress ignored).
+    """
+
+    E: Array
+    nu: Array
+    rho: Array
+    friction: Array
+    cohesion: Array
+    friction_fit: str = "triaxial"
+    volume_correction: bool = True
+    history_start: ClassVar[tuple[float, ...]] = (0.0,)
+
+    @property
+    def alpha(self) -> Array:
+        """Slope of the cone: |s| <= -alpha tr(tau) for the Kirchhoff deviator s (K16 eq. 24 for the triaxial fit)."""
+        sin = jnp.sin(self.friction)
+        if self.friction_fit == "plane_strain":
+            return math.sqrt(2) / 3 * sin
+        if self.friction_fit == "mc2d":
+            return sin / math.sqrt(2)
+        return math.sqrt(2 / 3) * 2 * sin / (3 - sin)
+
+    def update(self, e: Array, history: Array) -> tuple[Array, Array, Array]:
+        """Project the trial strain onto the cone: elastic inside, tip in tension, cone otherwise (K16 section 6.3)."""
+        lam, mu = lame(self.E, self.nu)
+        bulk = lam + 2 * mu / 3
+        values, axes = eigen(e)
+        eps_trial = 0.5 * jnp.log1p(jnp.maximum(values, LEAST_B - 1))
+        eps = eps_trial + history[0] / 3 if self.volume_correction else eps_trial
+        # Cohesion shifts the tip of the cone to the tension c cot(phi), as a volumetric strain.
+        tip = self.cohesion / (bulk * jnp.maximum(jnp.tan(self.friction), LEAST_TAN))
+        tr = jnp.sum(eps, axis=0)
+        deviator = eps - tr / 3
+        norm = jnp.sqrt(jnp.sum(deviator * deviator, axis=0) + TINY)
+        over = norm + 1.5 * bulk / mu * self.alpha * (tr - tip)  # dgamma of K16 eq. 27, (3 lam + 2 mu)/(2 mu) = 3K/2mu
+        in_tension = tr >= tip
+        on_cone = ~in_tension & (over > 0)
+        eps_cone = eps - jnp.maximum(over, 0) / norm * deviator
+        eps_new = jnp.where(in_tension, tip / 3, jnp.where(on_cone, eps_cone, eps))
+        if self.volume_correction:
+            gained = history[0] + jnp.sum(eps_trial, axis=0) - jnp.sum(eps_new, axis=0)
+            history = jnp.clip(gained, -VOLUME_CORRECTION_CAP, VOLUME_CORRECTION_CAP)[None]
+        e = compose(axes, jnp.expm1(2 * eps_new))
+        tau = compose(axes, 2 * mu * eps_new + lam * jnp.sum(eps_new, axis=0))
+        return e, history, tau
+
+    def energy(self, e: Array, history: Array) -> Array:
+        """Elastic energy density, (n,) J/m^3."""
+        eps = 0.5 * jnp.log1p(jnp.maximum(eigen(e)[0], LEAST_B - 1))
+        return hencky_energy(eps, *lame(self.E, self.nu))
+
+    def wave_speed(self) -> Array:
+        """Compression wave speed at rest, m/s."""
+        return p_wave_speed(self.E, self.nu, self.rho)

@@ -1,0 +1,421 @@
+"""Building a scene: the one place where its numbers are held against each other, and refused before anything runs."""
+
+from __future__ import annotations
+
+import base64
+import fnmatch
+import math
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jax import Array
+
+from coupling.bodies import Bodies, couple, points_near, start
+from coupling.contact import distances
+from mpm_env.config import nearest
+from mpm_env.fidelity import Fidelity
+from mpm_env.health import MOST_TRAVEL
+from mpm_env.motion import Motion
+from mpm_env.mpm import seeding
+from mpm_env.mpm.materials import MATERIALS, Material
+from mpm_env.mpm.stability import courant_limit, largest_dt
+from mpm_env.mpm.substep import Bed
+from mpm_env.mpm.transfer import CHUNK
+from mpm_env.mpm.types import MARGIN, Grid, Particles, Wall
+from mpm_env.scene_config import BodiesConfig, BoxFill, MaterialConfig, SceneConfig, SphereFill
+
+WHOLE = 1e-6  # how far from a whole number a ratio of two lengths or times may be, for rounding in the inputs
+CROWDED = 1.5  # grains near a tool may be packed this much denser than at the start
+OVERLAP = 0.25  # cells that a grain may start inside a body: the jitter of seeding, not a mistake
+
+
+class Sizes(NamedTuple):
+    """Static sizes of the buffers for points near bodies."""
+
+    nodes: int
+    grains: int
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Everything about a run that does not change while it runs."""
+
+    config: SceneConfig
+    fidelity: Fidelity
+    grid: Grid
+    materials: tuple[Material, ...]  # nominal; a State carries its own
+    spans: tuple[tuple[int, int], ...]  # slots of each material
+    fills: tuple[tuple[seeding.Fill, ...], ...]  # per material
+    gravity: np.ndarray  # (d,) m/s^2
+    rigid_dt: float  # s
+    mpm_dt: float  # s
+    mpm_per_rigid: int
+    bodies: Bodies | None
+    motion: Motion
+    sizes: Sizes
+    middle: float  # m, the slice's y in plane strain
+    dtype: Any
+
+    @property
+    def dimension(self) -> int:
+        """2 (plane strain) or 3."""
+        return self.grid.dimension
+
+    @property
+    def slots(self) -> int:
+        """Room for grains."""
+        return self.spans[-1][1] if self.spans else 0
+
+    def beds(self, materials: tuple[Material, ...]) -> tuple[Bed, ...]:
+        """Materials with the slots that are theirs."""
+        return tuple(Bed(mat, a, b) for mat, (a, b) in zip(materials, self.spans, strict=True))
+
+    def world(self, x: Array) -> Array:
+        """Grain positions (d, n) from the grid's origin, as points (3, n) m of the world."""
+        x = x + jnp.asarray(self.grid.origin, x.dtype)[:, None]
+        return lift(x, self.middle)
+
+    @property
+    def spacing(self) -> float:
+        """Distance of neighbouring grains at the start, m."""
+        return self.grid.cell_size / self.fidelity.particles_per_axis
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=["rigid", "grains", "materials", "steps", "health", "left", "reaction"],
+    meta_fields=[],
+)
+@dataclass(frozen=True)
+class State:
+    """A moment of a run: a pytree, so it jits, vmaps and can be stored."""
+
+    rigid: Any  # mjx.Data, or None where a scene has no bodies
+    grains: Particles
+    materials: tuple[Material, ...]
+    steps: Array  # () int32, rigid steps since the start
+    health: Array  # () int32, sticky bits of mpm_env.health.Health
+    left: Array  # () kg that left through open walls
+    reaction: Array  # (G, 6) N and N m on each coupled geom about its body's centre, mean over the last rigid step
+
+
+def lift(a: Array, y: float = 0.0) -> Array:
+    """Rows (2, n) of plane strain as rows (3, n) of space, the middle one y; rows (3, n) as they are."""
+    if a.shape[0] == 3:
+        return a
+    return jnp.stack([a[0], jnp.full_like(a[0], y), a[1]])
+
+
+def build(config: SceneConfig, fidelity: Fidelity) -> Scene:
+    """A scene at a fidelity. Raises ValueError, in one sentence, for whatever cannot be simulated as asked."""
+    dtype = _dtype(fidelity)
+    grid = _grid(config, fidelity)
+    d = grid.dimension
+    materials = tuple(_material(g.material, fidelity, dtype) for g in config.grains)
+    fills = tuple(tuple(_fill(f, config, grid, fidelity) for f in g.fill) for g in config.grains)
+    spans, at = [], 0
+    for some in fills:
+        count = sum(len(f.sites) for f in some)
+        chunked = -(-count // CHUNK) * CHUNK
+        spans.append((at, at + chunked))
+        at += chunked
+    model = _model(config.bodies, fidelity) if config.bodies else None
+    motion = Motion.of(config.bodies, model)
+    mpm_per_rigid = _substeps(config, fidelity, grid, materials, motion)
+    bodies = couple(model, _coupled(config.bodies, model)) if config.bodies and model is not None else None
+    middle = (config.box.lower[1] + config.box.upper[1]) / 2
+    scene = Scene(
+        config=config,
+        fidelity=fidelity,
+        grid=grid,
+        materials=materials,
+        spans=tuple(spans),
+        fills=fills,
+        gravity=np.asarray(config.gravity)[_axes(d)],
+        rigid_dt=fidelity.rigid_dt,
+        mpm_dt=fidelity.rigid_dt / mpm_per_rigid,
+        mpm_per_rigid=mpm_per_rigid,
+        bodies=bodies,
+        motion=motion,
+        sizes=_sizes(bodies, grid, fidelity, at, middle) if bodies else Sizes(0, 0),
+        middle=middle,
+        dtype=dtype,
+    )
+    _refuse_overlap(scene)
+    return scene
+
+
+def initial(scene: Scene, key: Array, *, qpos: Array | None = None) -> State:
+    """The start of a run: grains scattered by the key, bodies at their keyframe or at qpos (nq,)."""
+    g = scene.grid
+    d = g.dimension
+    rows: dict[str, list[Array]] = {"x": [], "v": [], "m": [], "V0": []}
+    origin = jnp.asarray(g.origin, scene.dtype)[:, None]
+    for material, fills, (a, b) in zip(scene.materials, scene.fills, scene.spans, strict=True):
+        empty = b - a - sum(len(f.sites) for f in fills)
+        for fill in fills:
+            key, key_fill = jax.random.split(key)
+            x, filled = seeding.scatter(fill, key_fill, scene.dtype)
+            n = x.shape[1]
+            rows["x"].append(x - origin)
+            rows["v"].append(jnp.broadcast_to(jnp.asarray(fill.velocity, scene.dtype)[:, None], (d, n)))
+            rows["m"].append(jnp.where(filled, material.rho * fill.volume, 0).astype(scene.dtype))
+            rows["V0"].append(jnp.full((n,), fill.volume, scene.dtype))
+        centre = jnp.asarray(g.shape, scene.dtype)[:, None] * (g.cell_size / 2)
+        rows["x"].append(jnp.broadcast_to(centre, (d, empty)).astype(scene.dtype))
+        rows["v"].append(jnp.zeros((d, empty), scene.dtype))
+        rows["m"].append(jnp.zeros((empty,), scene.dtype))
+        rows["V0"].append(jnp.ones((empty,), scene.dtype))
+    n, s = scene.slots, 4 if d == 2 else 6
+    joined = {
+        k: jnp.concatenate(v, axis=-1) if v else jnp.zeros((d, 0) if k in "xv" else (0,)) for k, v in rows.items()
+    }
+    depth = max((len(type(m).history_start) for m in scene.materials), default=0)
+    history = np.zeros((depth, n))
+    for material, (a, b) in zip(scene.materials, scene.spans, strict=True):
+        for k, value in enumerate(type(material).history_start):
+            history[k, a:b] = value
+    grains = Particles(
+        x=joined["x"],
+        v=jnp.where(joined["m"] > 0, joined["v"], 0),
+        C=jnp.zeros((d, d, n), scene.dtype),
+        e=jnp.zeros((s, n), scene.dtype),
+        tau=jnp.zeros((s, n), scene.dtype),
+        history=jnp.asarray(history, scene.dtype),
+        m=joined["m"],
+        V0=joined["V0"],
+    )
+    rigid = None
+    if scene.bodies is not None:
+        at = qpos if qpos is not None else _keyframe_qpos(scene)
+        rigid = start(scene.bodies, at, scene.motion.control(0.0), scene.motion.mocap(0.0))
+    geoms = len(scene.bodies.geoms) if scene.bodies else 0
+    return State(
+        rigid=rigid,
+        grains=grains,
+        materials=scene.materials,
+        steps=jnp.zeros((), jnp.int32),
+        health=jnp.zeros((), jnp.int32),
+        left=jnp.zeros((), scene.dtype),
+        reaction=jnp.zeros((geoms, 6), scene.dtype),
+    )
+
+
+def _axes(d: int) -> list[int]:
+    """The world axes that a grid of d dimensions has: x and z in plane strain."""
+    return [0, 2] if d == 2 else [0, 1, 2]
+
+
+def _dtype(fidelity: Fidelity) -> Any:
+    if fidelity.precision == "f64" and not jax.config.jax_enable_x64:
+        raise ValueError(
+            'precision = f64 needs 64-bit JAX, which is off: call jax.config.update("jax_enable_x64", True)'
+            " before building, or choose f32."
+        )
+    return jnp.float64 if fidelity.precision == "f64" else jnp.float32
+
+
+def _whole(ratio: float) -> int | None:
+    """The whole number that a ratio is, or None."""
+    n = round(ratio)
+    return n if n >= 1 and abs(ratio - n) < WHOLE * n else None
+
+
+def _grid(config: SceneConfig, fidelity: Fidelity) -> Grid:
+    axes = _axes(fidelity.dimension)
+    dx = config.feature / fidelity.cells
+    cells = []
+    for a in axes:
+        side = config.box.upper[a] - config.box.lower[a]
+        n = _whole(side / dx)
+        if n is None:
+            raise ValueError(
+                f"The box is {side:.6g} m along {'xyz'[a]}, which is {side / dx:.4g} cells of {dx:.6g} m: make it a whole"
+                f" number, with cells = {_fitting_cells(config, fidelity)} or a box of {max(round(side / dx), 1) * dx:.6g} m."
+            )
+        cells.append(n)
+    walls = [
+        tuple(
+            Wall(w.kind, w.friction) if (w := config.walls.get(f"{'xyz'[a]}_{side}")) else Wall()
+            for side in ("lower", "upper")
+        )
+        for a in axes
+    ]
+    return Grid(tuple(config.box.lower[a] for a in axes), tuple(cells), dx, tuple(walls))
+
+
+def _fitting_cells(config: SceneConfig, fidelity: Fidelity) -> str:
+    """Numbers of cells per feature near the one asked for that cut every side of the box into whole cells."""
+    sides = [config.box.upper[a] - config.box.lower[a] for a in _axes(fidelity.dimension)]
+    fits = [n for n in range(2, 200) if all(_whole(s * n / config.feature) for s in sides)]
+    return " or ".join(map(str, sorted(fits, key=lambda n: abs(n - fidelity.cells))[:2])) or "none (change the box)"
+
+
+def _material(config: MaterialConfig, fidelity: Fidelity, dtype: Any) -> Material:
+    values = config.model_dump(exclude={"model", "about"})
+    values["E"] *= fidelity.stiffness
+    if "friction_deg" in values:
+        values["friction"] = math.radians(values.pop("friction_deg"))
+    leaves = {k: v if isinstance(v, str | bool) else jnp.asarray(v, dtype) for k, v in values.items()}
+    return MATERIALS[config.model](**leaves)
+
+
+def _fill(fill: Any, config: SceneConfig, grid: Grid, fidelity: Fidelity) -> seeding.Fill:
+    axes = _axes(grid.dimension)
+    common = {
+        "target": grid.cell_size / fidelity.particles_per_axis,
+        "thickness": config.box.upper[1] - config.box.lower[1] if grid.dimension == 2 else 1.0,
+        "velocity": tuple(fill.velocity[a] for a in axes),
+    }
+    if isinstance(fill, BoxFill):
+        relief = seeding.Relief(fill.relief.height, fill.relief.wavelength) if fill.relief else None
+        low, high = np.asarray(fill.lower), np.asarray(fill.upper)
+        if not (low < high).all():
+            raise ValueError(f"A box of grains needs lower < upper on every axis, got {fill.lower} and {fill.upper}.")
+        # In plane strain the slice has the box's thickness: a bed narrower than the box has as much less mass in it.
+        if grid.dimension == 2:
+            common["thickness"] = fill.upper[1] - fill.lower[1]
+        made = seeding.fill_box(low[axes], high[axes], relief=relief, **common)
+        reach = (low, np.asarray([*high[:2], high[2] + (3 * relief.height if relief else 0)]))
+    elif isinstance(fill, SphereFill):
+        centre = np.asarray(fill.centre)
+        made = seeding.fill_ball(centre[axes], fill.radius, **common)
+        reach = (centre - fill.radius, centre + fill.radius)
+    else:
+        base, side = np.asarray(fill.base), np.asarray([fill.radius, fill.radius, 0])
+        made = seeding.fill_cylinder(base[axes], fill.radius, fill.height, **common)
+        reach = (base - side, base + side + np.asarray([0, 0, fill.height]))
+    for a in axes:
+        low, high = config.box.lower[a], config.box.upper[a]
+        if reach[0][a] < low - WHOLE or reach[1][a] > high + WHOLE:
+            raise ValueError(
+                f"A {fill.shape} of grains reaches from {reach[0][a]:.6g} to {reach[1][a]:.6g} m along {'xyz'[a]}, outside"
+                f" the simulated box from {low:.6g} to {high:.6g} m: move it or enlarge the box."
+            )
+    if not len(made.sites):
+        raise ValueError(
+            f"A {fill.shape} of grains is smaller than the distance {common['target']:.3g} m of two grains and would stay"
+            " empty: enlarge it or raise the fidelity's cells."
+        )
+    return made
+
+
+def _model(bodies: BodiesConfig, fidelity: Fidelity) -> mujoco.MjModel:
+    assets = {name: base64.b64decode(text) for name, text in bodies.assets.items()}
+    try:
+        model = mujoco.MjModel.from_xml_string(bodies.mjcf, assets)
+    except ValueError as error:
+        raise ValueError(f"bodies.mjcf is not a model that MuJoCo can read: {' '.join(str(error).split())}") from None
+    model.opt.timestep = fidelity.rigid_dt
+    return model
+
+
+def _coupled(bodies: BodiesConfig, model: mujoco.MjModel) -> dict[int, float]:
+    """Ids and friction of the coupled geoms."""
+    names = {i: model.geom(i).name for i in range(model.ngeom)}
+    known = [n for n in names.values() if n]
+    out: dict[int, float] = {}
+    for pattern in (*bodies.couple, *bodies.friction_of):
+        if not fnmatch.filter(known, pattern):
+            raise ValueError(f"The model has no geom named {pattern!r}{nearest(pattern, known)}")
+    for i, name in names.items():
+        if name and any(fnmatch.fnmatch(name, p) for p in bodies.couple):
+            special = [mu for p, mu in bodies.friction_of.items() if fnmatch.fnmatch(name, p)]
+            out[i] = special[-1] if special else bodies.friction
+    return out
+
+
+def _keyframe_qpos(scene: Scene) -> np.ndarray | None:
+    assert scene.bodies is not None and scene.config.bodies is not None
+    model, name = scene.bodies.model, scene.config.bodies.keyframe
+    if name is None:
+        return None
+    known = [model.key(i).name for i in range(model.nkey)]
+    if name not in known:
+        raise ValueError(f"The model has no keyframe {name!r}{nearest(name, known)}")
+    return np.asarray(model.key(name).qpos)
+
+
+def _substeps(config: SceneConfig, f: Fidelity, grid: Grid, materials: tuple[Material, ...], motion: Motion) -> int:
+    """How many substeps make a rigid step; refuses a substep longer than the stable one."""
+    fall = math.sqrt(2 * float(np.linalg.norm(config.gravity)) * (config.box.upper[2] - config.box.lower[2]))
+    thrown = max((float(np.linalg.norm(s.velocity)) for g in config.grains for s in g.fill), default=0.0)
+    tool = motion.top_speed()
+    speed = max(config.speed or fall, thrown, tool)
+    bound = largest_dt(materials, grid.cell_size, grid.dimension, speed)
+    if tool * f.rigid_dt > MOST_TRAVEL * grid.cell_size:
+        raise ValueError(
+            f"rigid_dt = {f.rigid_dt:.4g} s lets a tool of {tool:.3g} m/s move {tool * f.rigid_dt / grid.cell_size:.2g} cells"
+            f" in one rigid step: use <= {MOST_TRAVEL * grid.cell_size / tool:.3g} s or a slower tool."
+        )
+    wave = max((float(m.wave_speed()) for m in materials), default=0.0)
+    if f.mpm_dt is not None:
+        if f.mpm_dt > bound.dt * (1 + WHOLE):
+            raise ValueError(
+                f"mpm_dt = {f.mpm_dt:.4g} s exceeds the stable {bound.dt:.4g} s set by {bound.reason} at cell_size"
+                f" {grid.cell_size:.4g} m: use a smaller mpm_dt or fewer cells."
+            )
+        n = _whole(f.rigid_dt / f.mpm_dt)
+        if n is None:
+            raise ValueError(
+                f"rigid_dt = {f.rigid_dt:.6g} s is {f.rigid_dt / f.mpm_dt:.4g} substeps of mpm_dt = {f.mpm_dt:.6g} s: make it"
+                f" a whole number, with mpm_dt = {f.rigid_dt / math.ceil(f.rigid_dt / f.mpm_dt):.6g}."
+            )
+        return n
+    limit = min((courant_limit(float(m.nu), grid.dimension) for m in materials), default=f.courant)
+    if f.courant > limit:
+        raise ValueError(
+            f"courant = {f.courant:.3g} exceeds the stable {limit:.3g} for the Poisson ratios of this scene in"
+            f" {grid.dimension}-D: use <= {limit:.3g}."
+        )
+    longest = min(f.courant * grid.cell_size / wave if wave else f.rigid_dt, bound.dt, f.rigid_dt)
+    return math.ceil(f.rigid_dt / longest - WHOLE)
+
+
+def _sizes(bodies: Bodies, grid: Grid, f: Fidelity, slots: int, middle: float) -> Sizes:
+    """Room for the nodes and grains near bodies: their shells' volume, MOST_TRAVEL added for one rigid step."""
+    dx = grid.cell_size
+    slice_at = middle if grid.dimension == 2 else None
+    infinite = any(not np.isfinite(s.size[0]) or s.kind == int(mujoco.mjtGeom.mjGEOM_PLANE) for s in bodies.shapes)
+    shell = points_near(bodies, -NODE_DEPTH * dx, (f.contact_band + MOST_TRAVEL) * dx, dx, middle=slice_at)
+    near = points_near(bodies, -MOST_TRAVEL * dx, MOST_TRAVEL * dx, dx, middle=slice_at)
+    nodes = grid.nodes if infinite else min(grid.nodes, shell + 64)
+    grains = slots if infinite else min(slots, int(CROWDED * near * f.particles_per_axis**grid.dimension) + 64)
+    return Sizes(nodes, grains if f.push_out else 0)
+
+
+NODE_DEPTH = 2.0  # cells inside a body down to which nodes are looked at: deeper ones carry no grains
+
+
+def _refuse_overlap(scene: Scene) -> None:
+    """Refuse grains that start inside a body: MPM would squeeze them out with a bang."""
+    if scene.bodies is None or not scene.slots:
+        return
+    state = initial(scene, jax.random.key(0))
+    d = state.rigid
+    geoms = np.asarray(scene.bodies.geoms)
+    x = scene.world(state.grains.x).T
+    phi, _, geom = distances(scene.bodies.shapes, x, d.geom_xpos[geoms], d.geom_xmat[geoms])
+    phi = np.where(np.asarray(state.grains.m) > 0, np.asarray(phi), np.inf)
+    worst = int(np.argmin(phi))
+    if phi[worst] < -OVERLAP * scene.grid.cell_size:
+        inside = int(np.count_nonzero(phi < -OVERLAP * scene.grid.cell_size))
+        raise ValueError(
+            f"{inside} grains start inside the geom {scene.bodies.names[int(geom[worst])]!r}, up to {-phi[worst]:.3g} m deep:"
+            " move the body or the material apart."
+        )
+
+
+def inside_grid(grid: Grid, x: Array) -> Array:
+    """Which grains (n,) have their whole window on the grid."""
+    s = x / grid.cell_size
+    last = jnp.asarray([n - 1.5 for n in grid.shape], x.dtype)[:, None]
+    return jnp.all((s >= 0.5) & (s < last), axis=0)
+
+
+__all__ = ["MARGIN", "Scene", "State", "build", "initial", "inside_grid", "lift"]

@@ -1,0 +1,17 @@
+"""What every test runs under. Set here, before anything imports JAX, which reads its environment once."""
+
+import os
+from pathlib import Path
+
+import hypothesis
+
+# Tests compare with float64 oracles and to the bit across runs: the CPU, unless someone asks for a GPU.
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+
+# A coupled step takes many seconds to compile: keep every program for the next run and the other processes.
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).resolve().parent.parent / ".cache" / "jax"))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+
+# The first example of a shape compiles, so a deadline measures nothing; the same examples on every machine.
+hypothesis.settings.register_profile("house", deadline=None, derandomize=True)
+hypothesis.settings.load_profile("house")
