@@ -8,6 +8,7 @@ bodies that move with the joint velocities of the exchange.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -18,8 +19,9 @@ from jax import Array
 from mujoco import mjx
 from mujoco.mjx._src.types import IntegratorType
 
+from coupling.contact import distances
 from coupling.exchange import Twists
-from coupling.geoms import Shape, bounding_radius, centre, distance, half_extents, shape_of
+from coupling.geoms import Shape, bounding_radius, centre, half_extents, shape_of
 
 INTEGRATORS = {mujoco.mjtIntegrator.mjINT_EULER: "Euler", mujoco.mjtIntegrator.mjINT_IMPLICITFAST: "implicitfast"}
 
@@ -45,7 +47,7 @@ class Bodies:
     @property
     def yields(self) -> bool:
         """Whether any coupled body can give way to the grains; if none can, no exchange is solved."""
-        return any(self.model.body_weldid[b] != 0 for b in self.bodies)
+        return any(_jointed(self.model, b) for b in self.bodies)
 
     @property
     def steps(self) -> bool:
@@ -82,6 +84,13 @@ def couple(model: mujoco.MjModel, geoms: dict[int, float]) -> Bodies:
     ids = tuple(geoms)
     carriers = [int(model.geom_bodyid[g]) for g in ids]
     bodies = tuple(dict.fromkeys(carriers))
+    mocap = [int(model.body_mocapid[model.body_rootid[b]]) for b in bodies]
+    for body, on in zip(bodies, mocap, strict=True):
+        if on >= 0 and _jointed(model, body):
+            raise ValueError(
+                f"The coupled body {model.body(body).name!r} hangs by a joint on a mocap body, which moves it without"
+                " a velocity: give it a free joint and a weld to the mocap body, or no joint."
+            )
     return Bodies(
         model,
         mjx_model,
@@ -90,8 +99,13 @@ def couple(model: mujoco.MjModel, geoms: dict[int, float]) -> Bodies:
         tuple(geoms.values()),
         bodies,
         tuple(bodies.index(b) for b in carriers),
-        tuple(int(model.body_mocapid[model.body_rootid[b]]) if model.body_weldid[b] == 0 else -1 for b in bodies),
+        tuple(mocap),
     )
+
+
+def _jointed(model: mujoco.MjModel, body: int) -> bool:
+    """Whether any joint can move this body."""
+    return bool(model.body_treeid[body] >= 0)
 
 
 def start(b: Bodies, qpos: Array | None, ctrl: Array, mocap: tuple[Array, Array]) -> Any:
@@ -135,12 +149,18 @@ def _rotate(q: Array, v: Array) -> Array:
 
 def _quaternion_difference(a: Array, b: Array) -> Array:
     """Rotation vector (3,) rad in world axes that takes orientation a to orientation b."""
-    c = a * _CONJUGATE
-    w = b[0] * c[0] - jnp.dot(b[1:], c[1:])
-    v = b[0] * c[1:] + c[0] * b[1:] + jnp.cross(b[1:], c[1:])
+    turn = _product(b, a * _CONJUGATE)
+    w, v = turn[0], turn[1:]
     v = jnp.where(w < 0, -v, v)
     norm = jnp.sqrt(jnp.sum(v * v) + 1e-30)
     return 2 * jnp.arctan2(norm, jnp.abs(w)) / norm * v
+
+
+def _product(a: Array, b: Array) -> Array:
+    """The quaternion a b (4,) w x y z: turn by b, then by a."""
+    return jnp.concatenate(
+        [(a[0] * b[0] - jnp.dot(a[1:], b[1:]))[None], a[0] * b[1:] + b[0] * a[1:] + jnp.cross(a[1:], b[1:])]
+    )
 
 
 def refresh(b: Bodies, d: Any) -> Any:
@@ -148,8 +168,44 @@ def refresh(b: Bodies, d: Any) -> Any:
 
     MJX leaves those of the step's start behind.
     """
-    d = mjx.com_pos(b.mjx_model, mjx.kinematics(b.mjx_model, d))
-    return mjx.com_vel(b.mjx_model, d) if b.steps else d
+    if not b.steps:
+        return _carried(b, d)
+    return mjx.com_vel(b.mjx_model, mjx.com_pos(b.mjx_model, mjx.kinematics(b.mjx_model, d)))
+
+
+def _carried(b: Bodies, d: Any) -> Any:
+    """Data of a model without joints, which MJX refuses: all that hangs on a mocap body moves along with it."""
+    model, rest = b.model, mujoco.MjData(b.model)
+    mujoco.mj_kinematics(model, rest)
+    # One row per mocap body, and a last one for the world, to which mocap id -1 belongs.
+    hangs_on = model.body_mocapid[model.body_rootid]
+    dtype = d.mocap_pos.dtype
+    origin, upright = np.zeros((1, 3), dtype), np.asarray([[1, 0, 0, 0]], dtype)
+    p, q = jnp.concatenate([d.mocap_pos, origin]), jnp.concatenate([d.mocap_quat, upright])
+    p0, q0 = np.concatenate([rest.mocap_pos, origin]), np.concatenate([rest.mocap_quat, upright])
+    q0 /= np.linalg.norm(q0, axis=-1, keepdims=True)
+    q = q / jnp.linalg.norm(q, axis=-1, keepdims=True)
+    turn = jax.vmap(_product)(q, jnp.asarray(q0 * _CONJUGATE, dtype))
+    of_geom, of_site = hangs_on[model.geom_bodyid], hangs_on[model.site_bodyid]
+
+    def at(x: np.ndarray, on: np.ndarray) -> Array:
+        return p[on] + jax.vmap(_rotate)(turn[on], jnp.asarray(x - p0[on], dtype))
+
+    def axes(mat: np.ndarray, on: np.ndarray) -> Array:
+        columns = jnp.asarray(mat.reshape(-1, 3, 3), dtype)
+        return jax.vmap(jax.vmap(_rotate, in_axes=(None, 1), out_axes=1))(turn[on], columns)
+
+    return d.replace(
+        xpos=at(rest.xpos, hangs_on),
+        xquat=jax.vmap(_product)(turn[hangs_on], jnp.asarray(rest.xquat, dtype)),
+        xmat=axes(rest.xmat, hangs_on),
+        xipos=at(rest.xipos, hangs_on),
+        ximat=axes(rest.ximat, hangs_on),
+        geom_xpos=at(rest.geom_xpos, of_geom),
+        geom_xmat=axes(rest.geom_xmat, of_geom),
+        site_xpos=at(rest.site_xpos, of_site),
+        site_xmat=axes(rest.site_xmat, of_site),
+    )
 
 
 def open_step(b: Bodies, d: Any, prescribed: Array) -> tuple[Any, Stance]:
@@ -180,7 +236,7 @@ def open_step(b: Bodies, d: Any, prescribed: Array) -> tuple[Any, Stance]:
 
 
 def _integrated_mass(b: Bodies, d: Any) -> Array:
-    """The matrix (nv, nv) that MJX's integrator solves: with it the exchange and the integrator land on one velocity."""
+    """The matrix (nv, nv) that MJX's integrator solves, so that it lands on the velocity of the exchange."""
     model = b.mjx_model
     M = mjx.full_m(model, d)
     dt = b.model.opt.timestep
@@ -234,31 +290,38 @@ def turned(turn: Array, w: Array, dt: float) -> Array:
     return turn + (a * K + c * (K @ K)) @ turn
 
 
-def points_near(b: Bodies, low: float, high: float, spacing: float, *, middle: float | None = None) -> int:
-    """About how many points of a lattice of this spacing (m) lie between the distances low and high (m) of the geoms.
+def points_near(
+    b: Bodies, bands: tuple[tuple[float, float], ...], spacing: float, *, middle: float | None = None
+) -> tuple[int, ...]:
+    """About how many points of a lattice of this spacing (m) lie in each band (low, high) m of distance to the geoms.
 
-    Sizes node and grain buffers on the host. With `middle`, a plane y = middle is counted at the initial pose (plane
-    strain), else space. A geom without bound counts as nothing here: the caller takes the whole grid.
+    Sizes node and grain buffers on the host, at the initial pose, body by body. With `middle`, only the plane
+    y = middle is counted (plane strain). A geom without bounds counts as nothing: the caller takes the whole grid.
     """
-    total = 0
     d = mujoco.MjData(b.model)
     mujoco.mj_forward(b.model, d)
-    for g, shape in zip(b.geoms, b.shapes, strict=True):
-        if not np.isfinite(bounding_radius(shape)):
+    step = spacing / 2
+    high = max(top for _, top in bands)
+    total = np.zeros(len(bands), int)
+    for body in range(len(b.bodies)):
+        mine = [i for i, owner in enumerate(b.body_of) if owner == body and np.isfinite(bounding_radius(b.shapes[i]))]
+        if not mine:
             continue
-        pos, mat = d.geom_xpos[g], d.geom_xmat[g].reshape(3, 3)
-        step = spacing / 2
-        if middle is None:
-            half = half_extents(shape) + high
-            axes = [np.arange(-h, h + step, step) + c for h, c in zip(half, centre(shape), strict=True)]
-            local = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-            per_point = 8.0
-        else:
-            r = bounding_radius(shape) + high
-            side = np.arange(-r, r + step, step)
-            x, z = (a.ravel() for a in np.meshgrid(side, side, indexing="ij"))
-            local = (np.stack([x, np.full_like(x, middle - pos[1]), z], axis=-1)) @ mat
-            per_point = 4.0
-        phi = np.asarray(jax.vmap(distance, in_axes=(None, 0))(shape, jnp.asarray(local, jnp.float32)))
-        total += int(np.ceil(np.count_nonzero((phi > low) & (phi < high)) / per_point)) + 1
-    return total
+        shapes = tuple(b.shapes[i] for i in mine)
+        pos = np.asarray([d.geom_xpos[b.geoms[i]] for i in mine])
+        mat = np.asarray([d.geom_xmat[b.geoms[i]].reshape(3, 3) for i in mine])
+        reach = np.asarray([np.abs(m) @ half_extents(s) for m, s in zip(mat, shapes, strict=True)]) + high
+        at = pos + np.asarray([m @ centre(s) for m, s in zip(mat, shapes, strict=True)])
+        axes = [np.arange(lo, hi + step, step) for lo, hi in zip((at - reach).min(0), (at + reach).max(0), strict=True)]
+        if middle is not None:
+            axes[1] = np.asarray([middle])
+        x = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+        phi = np.asarray(_distances(shapes, jnp.asarray(x, jnp.float32), jnp.asarray(pos), jnp.asarray(mat)))
+        per_point = 8 if middle is None else 4
+        total += [-(-np.count_nonzero((phi > low) & (phi < top)) // per_point) for low, top in bands]
+    return tuple(int(n) for n in total)
+
+
+@partial(jax.jit, static_argnums=0)
+def _distances(shapes: tuple[Shape, ...], x: Array, pos: Array, mat: Array) -> Array:
+    return distances(shapes, x, pos, mat)[0]

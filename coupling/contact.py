@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from coupling.geoms import Shape, distance_and_normal
@@ -27,16 +29,35 @@ class Points(NamedTuple):
 def distances(shapes: tuple[Shape, ...], x: Array, pos: Array, mat: Array) -> tuple[Array, Array, Array]:
     """Signed distance (K,) m, outward normal (K, 3) and index (K,) of the geom nearest to points x (K, 3) m.
 
-    Geoms stand at pos (G, 3) m with axes mat (G, 3, 3), columns in world coordinates.
+    Geoms stand at pos (G, 3) m with axes mat (G, 3, 3), columns in world coordinates. Geoms of one kind are computed
+    together, so that a bucket of many plates compiles as one.
     """
+
+    def one(shape: Shape, at: Array, axes: Array) -> tuple[Array, Array]:
+        phi, n = jax.vmap(partial(distance_and_normal, shape))((x - at) @ axes)
+        return phi, n @ axes.T
+
+    order: list[int] = []
     phis, normals = [], []
-    for g, shape in enumerate(shapes):
-        phi, n = jax.vmap(distance_and_normal, in_axes=(None, 0))(shape, (x - pos[g]) @ mat[g])
+    for kind in dict.fromkeys(shape.kind for shape in shapes):
+        mine = [i for i, shape in enumerate(shapes) if shape.kind == kind]
+        order += mine
+        if shapes[mine[0]].voxels is not None:
+            both = [one(shapes[i], pos[i], mat[i]) for i in mine]
+            phis.append(jnp.stack([phi for phi, _ in both]))
+            normals.append(jnp.stack([n for _, n in both]))
+            continue
+        index = np.asarray(mine)
+        sizes = jnp.asarray([shapes[i].size for i in mine], x.dtype)
+        phi, n = jax.vmap(lambda size, at, axes, kind=kind: one(Shape(kind, size), at, axes))(
+            sizes, pos[index], mat[index]
+        )
         phis.append(phi)
-        normals.append(n @ mat[g].T)
-    phi, normal = jnp.stack(phis), jnp.stack(normals)
-    geom = jnp.argmin(phi, axis=0)
-    return jnp.min(phi, axis=0), jnp.take_along_axis(normal, geom[None, :, None], axis=0)[0], geom
+        normals.append(n)
+    phi, normal = jnp.concatenate(phis), jnp.concatenate(normals)
+    nearest = jnp.argmin(phi, axis=0)
+    n = jnp.take_along_axis(normal, nearest[None, :, None], axis=0)[0]
+    return jnp.min(phi, axis=0), n, jnp.asarray(order, jnp.int32)[nearest]
 
 
 def impulses(p: Points, w: Array, mu: Array) -> Array:

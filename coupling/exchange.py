@@ -51,68 +51,62 @@ def exchange(p: Points, t: Twists, q_free: Array, mu: Array, body_of: tuple[int,
     mu (G,) is the friction coefficient of each geom, body_of the body of each geom. No iterations are made when no
     coupled body can yield (nv == 0): then the law is explicit.
     """
-    geom_body = jnp.asarray(body_of, jnp.int32)
-    body = geom_body[p.geom]
+    body = jnp.asarray(body_of, jnp.int32)[p.geom]
     friction = mu[p.geom]
     r = p.x - t.centre[body]
-    count = t.centre.shape[0]
-    member = (body[:, None] == jnp.arange(count)).astype(p.v.dtype)  # (K, B)
+    prescribed = t.d[body]
+    drift = prescribed[:, :3] + jnp.cross(prescribed[:, 3:], r)
+    if t.M.shape[0] == 0:
+        f = impulses(p, p.v - drift, friction)
+        zero = jnp.zeros((), p.v.dtype)
+        return Exchange(q_free, f, _per_geom(f, p, r, len(body_of)), zero, zero + 1)
+    # How the body's points under the grid points move with q: (K, 3, nv), and flat as (3K, nv).
+    J = t.J[body]
+    lever = (J[:, :3] + jnp.cross(J[:, 3:], r[:, :, None], axis=1)).reshape(-1, t.M.shape[0])
 
-    def relative(q: Array) -> Array:
-        u = (t.J @ q + t.d)[body]
-        return p.v - u[:, :3] - jnp.cross(u[:, 3:], r)
+    w_free = p.v - drift - (lever @ q_free).reshape(-1, 3)
 
-    def wrenches(f: Array, onto: Array) -> Array:
-        """Sum of forces f (K, 3) with their moments per column of onto (K, B or G): (columns, 6)."""
-        return onto.T @ jnp.concatenate([f, jnp.cross(r, f)], axis=-1)
+    # The unknown is the change of q, not q: a heavy body's would drown in the rounding of q.
+    def relative(change: Array) -> Array:
+        return w_free - (lever @ change).reshape(-1, 3)
 
     def pull(f: Array) -> Array:
         """Generalised impulse (nv,) of impulses f (K, 3) on the bodies."""
-        return jnp.einsum("bkn,bk->n", t.J, wrenches(f, member))
-
-    if t.M.shape[0] == 0:
-        f = impulses(p, relative(q_free), friction)
-        zero = jnp.zeros((), p.v.dtype)
-        return Exchange(q_free, f, _per_geom(f, p, r, len(body_of)), zero, zero + 1)
-
-    lever = jnp.concatenate([jnp.broadcast_to(jnp.eye(3, dtype=r.dtype), (r.shape[0], 3, 3)), -_cross(r)], axis=-1)
+        return f.reshape(-1) @ lever
 
     def added_mass(D: Array) -> Array:
-        """sum_b J_b^T (sum_i A_i^T D_i A_i) J_b, (nv, nv): the one large reduction."""
-        DA = D @ lever  # (K, 3, 6)
-        per_body = jnp.einsum("kia,kib,kB->Bab", lever, DA, member)
-        return jnp.einsum("Bam,Bab,Bbn->mn", t.J, per_body, t.J)
+        """What points that answer with D (K, 3, 3) kg add to the bodies' inertia, (nv, nv)."""
+        return lever.T @ (D @ lever.reshape(-1, 3, t.M.shape[0])).reshape(lever.shape)
 
-    everyone = p.m[:, None, None] * jnp.eye(3, dtype=r.dtype)
-    metric = jnp.linalg.inv(t.M + added_mass(everyone))
+    metric = jnp.linalg.inv(t.M + lever.T @ (jnp.repeat(p.m, 3)[:, None] * lever))
 
-    def residual(q: Array) -> Array:
-        return t.M @ (q - q_free) + pull(impulses(p, relative(q), friction))
+    def residual(change: Array) -> Array:
+        return t.M @ change + pull(impulses(p, relative(change), friction))
 
     def size(R: Array) -> Array:
         return jnp.sqrt(jnp.maximum(R @ metric @ R, 0))
 
-    stuck = metric @ (t.M @ q_free + pull(p.m[:, None] * (relative(0 * q_free))))
-    start = size(residual(q_free))
-    q = jnp.where(size(residual(stuck)) < start, stuck, q_free)
-    steps = jnp.asarray(STEPS, q.dtype)
+    none, stuck = jnp.zeros_like(q_free), metric @ pull(p.m[:, None] * w_free)
+    start = size(residual(none))
+    change = jnp.where(size(residual(stuck)) < start, stuck, none)
+    steps = jnp.asarray(STEPS, q_free.dtype)
 
-    def newton(_: int, q: Array) -> Array:
-        H = t.M + added_mass(stiffness(p, relative(q), friction))
-        step = -jnp.linalg.solve(H, residual(q))
-        tries = q + steps[:, None] * step
+    def newton(_: int, change: Array) -> Array:
+        H = t.M + added_mass(stiffness(p, relative(change), friction))
+        step = -jnp.linalg.solve(H, residual(change))
+        tries = change + steps[:, None] * step
         sizes = jax.vmap(lambda trial: size(residual(trial)))(tries)
         best = jnp.argmin(sizes)
-        return jnp.where(sizes[best] < size(residual(q)), tries[best], q)
+        return jnp.where(sizes[best] < size(residual(change)), tries[best], change)
 
-    q = jax.lax.fori_loop(0, iterations, newton, q)
-    f = impulses(p, relative(q), friction)
+    change = jax.lax.fori_loop(0, iterations, newton, change)
+    f = impulses(p, relative(change), friction)
     push = jnp.linalg.solve(t.M, pull(f))  # what the bodies give: q = q_free - push
-    work = jnp.sum(f * relative(q_free))
+    work = jnp.sum(f * w_free)
     doubled = jnp.sum(jnp.sum(f * f, axis=-1) / jnp.where(p.m > 0, p.m, 1)) + pull(f) @ push
     noise = NOISE * jnp.sum(p.m * jnp.sum(p.v * p.v, axis=-1))
     noticeable = jnp.abs(work) > noise
-    left = jnp.where(start * start > noise, size(residual(q)) / jnp.maximum(start, jnp.finfo(q.dtype).tiny), 0)
+    left = jnp.where(start * start > noise, size(residual(change)) / jnp.maximum(start, jnp.finfo(start.dtype).tiny), 0)
     scale = jnp.where(noticeable & (doubled > 0), jnp.clip(-work / jnp.where(doubled > 0, doubled, 1), 0, 1), 1)
     f = scale * f
     return Exchange(q_free - scale * push, f, _per_geom(f, p, r, len(body_of)), left, scale)
@@ -122,10 +116,3 @@ def _per_geom(f: Array, p: Points, r: Array, count: int) -> Array:
     """Impulse wrench (G, 6) on each geom: the reaction of the impulses f (K, 3) on its points."""
     onto = (p.geom[:, None] == jnp.arange(count)).astype(f.dtype)
     return -onto.T @ jnp.concatenate([f, jnp.cross(r, f)], axis=-1)
-
-
-def _cross(r: Array) -> Array:
-    """Matrices (K, 3, 3) with [r]x w = r x w."""
-    x, y, z = r[:, 0], r[:, 1], r[:, 2]
-    o = jnp.zeros_like(x)
-    return jnp.stack([jnp.stack([o, -z, y], -1), jnp.stack([z, o, -x], -1), jnp.stack([-y, x, o], -1)], axis=-2)

@@ -3,16 +3,23 @@
     read_scene, load_fidelity    what is simulated, and how finely, from files
     build, initial               a checked Scene, and its first State
     step, advance, scripted      the coupled simulation as pure functions
-    run                          a scene to a folder of results
-    make_task                    a task as pure functions: reset(key), step(state, action)
+    run.run, demo.demo           a scene, or a task's script, to a folder of results
+    make_task                    a task; tasks.reset(task, key) and tasks.step(task, episode, action) are pure
 
 Importing registers the Gymnasium environments mpm_env/DigSand-v0, DigSnow-v0, PushSand-v0 and PushSnow-v0.
 """
 
 from __future__ import annotations
 
+import os
 from importlib import import_module
 from typing import Any
+
+import gymnasium
+
+# XLA hands the many small kernels of a substep to a pool of threads and loses more than it gains: on two cores the same
+# run takes 1.7 times as long. JAX reads this when it starts its CPU client; set NPROC yourself to decide otherwise.
+os.environ.setdefault("NPROC", "1")
 
 # Loaded when first asked for, so that `import mpm_env` stays light.
 _HOMES = {
@@ -30,6 +37,8 @@ _HOMES = {
     "scripted": "sim",
     "step": "sim",
     "Health": "health",
+    "make_task": "tasks",
+    "read_task": "tasks",
 }
 
 __all__ = list(_HOMES)
@@ -39,3 +48,17 @@ def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module 'mpm_env' has no attribute {name!r}")
     return getattr(import_module(f"mpm_env.{_HOMES[name]}"), name)
+
+
+for _id, _task in {
+    "DigSand": "dig_sand",
+    "DigSnow": "dig_snow",
+    "PushSand": "push_sand",
+    "PushSnow": "push_snow",
+}.items():
+    gymnasium.register(
+        f"mpm_env/{_id}-v0",
+        entry_point="mpm_env.env:GrainsEnv",
+        vector_entry_point="mpm_env.env:GrainsVectorEnv",
+        kwargs={"task": _task},
+    )

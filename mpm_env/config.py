@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import difflib
+import json
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args
 
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
@@ -42,13 +43,13 @@ def known(kind: str) -> list[str]:
     return sorted(p.stem for p in (folder() / kind).glob("*.yaml"))
 
 
-def find(kind: str, name: str) -> Path:
-    """The file of a shipped name, or of a path of one's own ending in .yaml."""
+def find(kind: str, name: str, beside: Path = Path()) -> Path:
+    """The file of a shipped name, or of a path of one's own ending in .yaml, looked for in a folder first."""
     if name.endswith((".yaml", ".yml")):
-        path = Path(name)
-        if not path.is_file():
-            raise ValueError(f"There is no file {name}.")
-        return path
+        for path in (beside / name, Path(name)):
+            if path.is_file():
+                return path
+        raise ValueError(f"There is no file {name}.")
     if name not in known(kind):
         raise ValueError(f"There is no {kind[:-1].replace('ie', 'y')} {name!r}{nearest(name, known(kind))}")
     return folder() / kind / f"{name}.yaml"
@@ -65,6 +66,8 @@ def read_yaml(path: Path) -> dict[str, Any]:
     """The mapping in a YAML file."""
     try:
         data = yaml.load(path.read_text(encoding="utf-8"), _Loader)
+    except OSError as error:
+        raise ValueError(f"{path} cannot be read: {error.strerror}.") from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ValueError(f"{path} is not YAML: {' '.join(str(error).split())}.") from None
     if not isinstance(data, dict):
@@ -90,49 +93,72 @@ def overlay(data: dict[str, Any], settings: Sequence[str]) -> None:
                 node[keys[-1]] = value
             else:
                 raise KeyError(keys[-1])
-        except (KeyError, IndexError, ValueError):
-            names = list(node) if isinstance(node, dict) else [str(i) for i in range(len(node or []))]
-            raise ValueError(f"The setting {path!r} names nothing here; known at that place: {names}.") from None
+        except (KeyError, IndexError, ValueError, TypeError):
+            raise ValueError(f"The setting {path!r} names nothing here; {_known_in(node)}.") from None
         except yaml.YAMLError:
             raise ValueError(f"The value in {setting!r} cannot be read.") from None
 
 
+def _known_in(node: Any) -> str:
+    names = list(node) if isinstance(node, dict) else range(len(node)) if isinstance(node, list) else []
+    return f"known at that place: {', '.join(map(str, names))}" if names else "there is nothing below that place"
+
+
 def parse(schema: type[T], data: dict[str, Any], name: str) -> T:
-    """Data as a checked configuration; the first fault becomes one sentence that names file, key, value and bound."""
+    """Data as a checked configuration; the first fault becomes one sentence that names file, key, value and bound.
+
+    Types are strict: a number in quotes, or a yes where a number belongs, is refused and not converted.
+    """
     try:
-        return schema.model_validate(data)
+        return schema.model_validate_json(json.dumps(data, default=_plain), strict=True)
     except ValidationError as error:
         raise ValueError(f"{name}: {_sentence(schema, error)}") from None
 
 
+def _plain(value: Any) -> Any:
+    """What JSON has no word for: arrays as lists, anything else as its text, which the schema then refuses."""
+    return value.tolist() if hasattr(value, "tolist") else str(value)
+
+
 def _sentence(schema: type[BaseModel], error: ValidationError) -> str:
     fault = error.errors(include_url=False)[0]
-    place = ".".join(str(p) for p in fault["loc"])
+    steps, beside = _walk(schema, fault["loc"])
+    place = ".".join(steps)
     if fault["type"] == "extra_forbidden":
-        return f"unknown key {place!r}{nearest(str(fault['loc'][-1]), _keys_beside(schema, fault['loc']))}"
+        return f"unknown key {place!r}{nearest(steps[-1], beside)}"
     if fault["type"] == "missing":
         return f"the key {place!r} is missing."
+    if fault["type"] in ("union_tag_not_found", "union_tag_invalid"):
+        return f"{place} {_tag_sentence(fault['ctx'])}"
     message = fault["msg"].removeprefix("Value error, ").removeprefix("Input ").rstrip(".")
     got = fault["input"]
     shown = f", got {got!r}" if fault["type"] != "value_error" and not isinstance(got, dict | list) else ""
     return f"{place} {message}{shown}." if place else f"{message}{shown}."
 
 
-def _keys_beside(schema: Any, loc: tuple[int | str, ...]) -> list[str]:
-    """The keys a schema knows at the place of an unknown one; nothing where the place has no fixed keys."""
-    fields: dict[str, Any] = {}
-    pending: list[Any] = [schema]
-    for step in (*loc[:-1], None):
-        models = [m for t in pending for m in _models_in(t)]
-        if step is None:
-            for m in models:
-                fields.update(m.model_fields)
-        elif any(isinstance(step, str) and step in m.model_fields for m in models):
-            pending = [m.model_fields[step].annotation for m in models if step in m.model_fields]
-        else:  # a list index, or the tag of a union
-            tagged = [m for m in models if any(f.default == step for f in m.model_fields.values())]
-            pending = list(tagged or models)
-    return list(fields)
+def _tag_sentence(context: dict[str, Any]) -> str:
+    key = context["discriminator"].strip("'")
+    if "tag" not in context:
+        return f"needs the key {key!r}."
+    known = [tag.strip("' ") for tag in context["expected_tags"].split(",")]
+    return f"has no {key} {context['tag']!r}{nearest(context['tag'], known)}"
+
+
+def _walk(schema: Any, loc: tuple[int | str, ...]) -> tuple[list[str], list[str]]:
+    """The steps to a fault as they stand in the file, and the keys that the schema knows where the last one is."""
+    models, steps = [schema], []
+    for step in loc:
+        beside = list(dict.fromkeys(key for m in models for key in m.model_fields))
+        tagged = [m for m in models if any(step in get_args(f.annotation) for f in m.model_fields.values())]
+        if step not in beside and tagged:  # the tag of a union: pydantic's word, not the file's
+            models = tagged
+            continue
+        steps.append(str(step))
+        if step in beside:
+            models = [
+                k for m in models if step in m.model_fields for k in _models_in(m.model_fields[str(step)].annotation)
+            ]
+    return steps, beside if loc else []
 
 
 def _models_in(annotation: Any) -> list[type[BaseModel]]:

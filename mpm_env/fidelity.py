@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated, Literal
 
 from pydantic import Field
 
-from mpm_env.config import Section, find, parse, read_yaml
+from mpm_env.config import Section, find, overlay, parse, read_yaml
 
 Positive = Annotated[float, Field(gt=0)]
 
@@ -22,7 +23,7 @@ class Fidelity(Section):
     mpm_dt: Positive | None = Field(None, description="s; the substep, if not the longest that courant allows")
     rigid_dt: Positive = Field(0.004, description="s; one MJX step, a whole number of substeps")
     stiffness: Annotated[float, Field(gt=0, le=1)] = Field(
-        1.0, description="factor on Young's moduli: softer is faster"
+        1.0, description="factor on Young's modulus of sand, whose strength does not depend on it: softer is faster"
     )
     precision: Literal["f32", "f64"] = "f32"
     contact_band: Annotated[float, Field(ge=0, le=1)] = Field(0.5, description="cells off a body where nodes feel it")
@@ -32,7 +33,9 @@ class Fidelity(Section):
     )
 
 
-def load_fidelity(name: str) -> Fidelity:
-    """A shipped fidelity by name, or one from a .yaml file."""
+def load_fidelity(name: str, settings: Sequence[str] = ()) -> Fidelity:
+    """A shipped fidelity by name, or one from a .yaml file, with settings like "cells=5" on top."""
     path = find("fidelities", name)
-    return parse(Fidelity, read_yaml(path), path.name)
+    data = read_yaml(path)
+    overlay(data, settings)
+    return parse(Fidelity, data, path.name)

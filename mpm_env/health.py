@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import IntFlag
 
 MOST_DEPTH = 0.5  # cells a grain may stand inside a body before contact is called lost
-MOST_TRAVEL = 0.5  # cells a body may move in one rigid step: the points near it are looked up once per rigid step
+MOST_TRAVEL = 0.25  # cells a body may move in one rigid step: the points near it are looked up once per rigid step
 
 
 class Health(IntFlag):
@@ -32,7 +32,7 @@ SENTENCES: dict[Health, str] = {
     Health.NODES_OVERFLOW: "More grid nodes are near bodies than were set aside: contact is incomplete.",
     Health.GRAINS_OVERFLOW: "More grains are near bodies than were set aside: contact is incomplete.",
     Health.NOT_CONVERGED: "Contact between grains and bodies was not solved: raise contact_iterations.",
-    Health.BODY_TOO_FAST: "A coupled body moved more than half a cell in one rigid step: use a smaller rigid_dt.",
+    Health.BODY_TOO_FAST: "A coupled body moved more than a quarter of a cell in one rigid step: use a smaller rigid_dt.",
 }
 
 

@@ -103,9 +103,10 @@ def open_viewer(path: str | os.PathLike[str]) -> None:
     if end < path.stat().st_size:
         path = _copy_up_to(end, path, tempfile.mkdtemp(prefix="mpm_env_"))
     command = [*RERUN_COMMAND, str(path), "--bind", "127.0.0.1", "--port", "auto"]
+    quiet = {"RERUN_ANALYTICS": "0", **os.environ}
     with tempfile.TemporaryFile() as complaints:
         viewer = subprocess.Popen(
-            command, env=_quiet(), stdout=subprocess.DEVNULL, stderr=complaints, start_new_session=True
+            command, env=quiet, stdout=subprocess.DEVNULL, stderr=complaints, start_new_session=True
         )
         try:
             code = viewer.wait(VIEWER_SETTLES_S)
@@ -235,7 +236,7 @@ def _read_rows(source: Path, path: Path) -> _Rows:
 
 def _check_harmless(source: Path, path: Path) -> None:
     """Let another process decode the file first: some damaged bytes abort the process that reads them."""
-    trial = subprocess.run([*RERUN_COMMAND, "rrd", "stats", str(source)], env=_quiet(), capture_output=True)
+    trial = subprocess.run([*RERUN_COMMAND, "rrd", "stats", str(source)], capture_output=True)
     if trial.returncode not in RERUN_EXIT_CODES:
         raise ValueError(f"{path} is damaged: Rerun cannot decode it.")
 
@@ -255,7 +256,3 @@ def _checked_recipe(path: Path, rows: _Rows) -> dict[str, Any]:
         raise ValueError(f"{path} is damaged: its recipe does not match the sha256 stored beside it.")
     recipe: dict[str, Any] = json.loads(text)
     return recipe
-
-
-def _quiet() -> dict[str, str]:
-    return {**os.environ, "RERUN_ANALYTICS": "0"}

@@ -27,10 +27,11 @@ from mpm_env.mpm.stability import courant_limit, largest_dt
 from mpm_env.mpm.substep import Bed
 from mpm_env.mpm.transfer import CHUNK
 from mpm_env.mpm.types import MARGIN, Grid, Particles, Wall
-from mpm_env.scene_config import BodiesConfig, BoxFill, MaterialConfig, SceneConfig, SphereFill
+from mpm_env.scene_config import BodiesConfig, BoxFill, MaterialConfig, SceneConfig, SphereFill, Vec3
 
 WHOLE = 1e-6  # how far from a whole number a ratio of two lengths or times may be, for rounding in the inputs
 CROWDED = 1.5  # grains near a tool may be packed this much denser than at the start
+ROOM = 1.3  # how many more nodes than counted at the start may be near a tool, for how it turns and lies in the grid
 OVERLAP = 0.25  # cells that a grain may start inside a body: the jitter of seeding, not a mistake
 
 
@@ -114,6 +115,8 @@ def lift(a: Array, y: float = 0.0) -> Array:
 def build(config: SceneConfig, fidelity: Fidelity) -> Scene:
     """A scene at a fidelity. Raises ValueError, in one sentence, for whatever cannot be simulated as asked."""
     dtype = _dtype(fidelity)
+    if config.plane_strain:
+        fidelity = fidelity.model_copy(update={"dimension": 2})
     grid = _grid(config, fidelity)
     d = grid.dimension
     materials = tuple(_material(g.material, fidelity, dtype) for g in config.grains)
@@ -124,7 +127,7 @@ def build(config: SceneConfig, fidelity: Fidelity) -> Scene:
         chunked = -(-count // CHUNK) * CHUNK
         spans.append((at, at + chunked))
         at += chunked
-    model = _model(config.bodies, fidelity) if config.bodies else None
+    model = _model(config.bodies, fidelity, config.gravity) if config.bodies else None
     motion = Motion.of(config.bodies, model)
     mpm_per_rigid = _substeps(config, fidelity, grid, materials, motion)
     bodies = couple(model, _coupled(config.bodies, model)) if config.bodies and model is not None else None
@@ -195,7 +198,7 @@ def initial(scene: Scene, key: Array, *, qpos: Array | None = None) -> State:
         at = qpos if qpos is not None else _keyframe_qpos(scene)
         rigid = start(scene.bodies, at, scene.motion.control(0.0), scene.motion.mocap(0.0))
     geoms = len(scene.bodies.geoms) if scene.bodies else 0
-    return State(
+    state = State(
         rigid=rigid,
         grains=grains,
         materials=scene.materials,
@@ -204,6 +207,8 @@ def initial(scene: Scene, key: Array, *, qpos: Array | None = None) -> State:
         left=jnp.zeros((), scene.dtype),
         reaction=jnp.zeros((geoms, 6), scene.dtype),
     )
+    # MJX commits its arrays to a device. The others go along, or the first step would compile a second time.
+    return jax.device_put(state, jax.devices()[0])
 
 
 def _axes(d: int) -> list[int]:
@@ -258,7 +263,8 @@ def _fitting_cells(config: SceneConfig, fidelity: Fidelity) -> str:
 
 def _material(config: MaterialConfig, fidelity: Fidelity, dtype: Any) -> Material:
     values = config.model_dump(exclude={"model", "about"})
-    values["E"] *= fidelity.stiffness
+    if config.model == "sand":  # its strength is friction; snow yields at critical strains, so E is its strength
+        values["E"] *= fidelity.stiffness
     if "friction_deg" in values:
         values["friction"] = math.radians(values.pop("friction_deg"))
     leaves = {k: v if isinstance(v, str | bool) else jnp.asarray(v, dtype) for k, v in values.items()}
@@ -305,13 +311,14 @@ def _fill(fill: Any, config: SceneConfig, grid: Grid, fidelity: Fidelity) -> see
     return made
 
 
-def _model(bodies: BodiesConfig, fidelity: Fidelity) -> mujoco.MjModel:
+def _model(bodies: BodiesConfig, fidelity: Fidelity, gravity: Vec3) -> mujoco.MjModel:
     assets = {name: base64.b64decode(text) for name, text in bodies.assets.items()}
     try:
         model = mujoco.MjModel.from_xml_string(bodies.mjcf, assets)
     except ValueError as error:
         raise ValueError(f"bodies.mjcf is not a model that MuJoCo can read: {' '.join(str(error).split())}") from None
     model.opt.timestep = fidelity.rigid_dt
+    model.opt.gravity[:] = gravity  # the scene's, so that grains and bodies fall alike
     return model
 
 
@@ -382,9 +389,9 @@ def _sizes(bodies: Bodies, grid: Grid, f: Fidelity, slots: int, middle: float) -
     dx = grid.cell_size
     slice_at = middle if grid.dimension == 2 else None
     infinite = any(not np.isfinite(s.size[0]) or s.kind == int(mujoco.mjtGeom.mjGEOM_PLANE) for s in bodies.shapes)
-    shell = points_near(bodies, -NODE_DEPTH * dx, (f.contact_band + MOST_TRAVEL) * dx, dx, middle=slice_at)
-    near = points_near(bodies, -MOST_TRAVEL * dx, MOST_TRAVEL * dx, dx, middle=slice_at)
-    nodes = grid.nodes if infinite else min(grid.nodes, shell + 64)
+    bands = (-NODE_DEPTH * dx, (f.contact_band + MOST_TRAVEL) * dx), (-MOST_TRAVEL * dx, MOST_TRAVEL * dx)
+    shell, near = points_near(bodies, bands, dx, middle=slice_at)
+    nodes = grid.nodes if infinite else min(grid.nodes, int(ROOM * shell) + 64)
     grains = slots if infinite else min(slots, int(CROWDED * near * f.particles_per_axis**grid.dimension) + 64)
     return Sizes(nodes, grains if f.push_out else 0)
 
@@ -396,12 +403,15 @@ def _refuse_overlap(scene: Scene) -> None:
     """Refuse grains that start inside a body: MPM would squeeze them out with a bang."""
     if scene.bodies is None or not scene.slots:
         return
-    state = initial(scene, jax.random.key(0))
-    d = state.rigid
-    geoms = np.asarray(scene.bodies.geoms)
-    x = scene.world(state.grains.x).T
-    phi, _, geom = distances(scene.bodies.shapes, x, d.geom_xpos[geoms], d.geom_xmat[geoms])
-    phi = np.where(np.asarray(state.grains.m) > 0, np.asarray(phi), np.inf)
+    shapes, geoms = scene.bodies.shapes, np.asarray(scene.bodies.geoms)
+
+    def look(key: Array) -> tuple[Array, Array]:
+        state = initial(scene, key)
+        d = state.rigid
+        phi, _, geom = distances(shapes, scene.world(state.grains.x).T, d.geom_xpos[geoms], d.geom_xmat[geoms])
+        return jnp.where(state.grains.m > 0, phi, jnp.inf), geom
+
+    phi, geom = map(np.asarray, jax.jit(look)(jax.random.key(0)))
     worst = int(np.argmin(phi))
     if phi[worst] < -OVERLAP * scene.grid.cell_size:
         inside = int(np.count_nonzero(phi < -OVERLAP * scene.grid.cell_size))

@@ -13,6 +13,7 @@ Vec3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
+PACKAGE = "package:"  # before the name of an .xml that this package ships
 SIDES = ("x_lower", "x_upper", "y_lower", "y_upper", "z_lower", "z_upper")
 
 
@@ -134,7 +135,7 @@ class Waypoint(Section):
 class BodiesConfig(Section):
     """A MuJoCo model and what of it meets the grains."""
 
-    mjcf: str  # the MJCF text itself; in a file, the name of an .xml beside it
+    mjcf: str  # the MJCF text itself; in a file, the name of an .xml beside it, or package:NAME
     assets: dict[str, str] = {}  # mesh and texture files the model needs, base64; filled when a file is read
     couple: Annotated[list[str], Field(min_length=1)]  # names or patterns of the coupled geoms
     friction: NotNegative = 0.4  # between coupled geoms and grains
@@ -158,6 +159,7 @@ class SceneConfig(Section):
     name: str
     about: str = ""
     box: Box  # the simulated space
+    plane_strain: bool = False  # simulated in 2-D, its middle slice, whatever the fidelity's dimension
     feature: Positive  # m; the length that a fidelity cuts into its number of cells
     gravity: Vec3 = (0.0, 0.0, -9.81)
     duration: Positive  # s
@@ -191,12 +193,14 @@ def read_scene(name: str, settings: tuple[str, ...] = ()) -> SceneConfig:
 
 def resolve(data: dict[str, Any], folder: Path) -> None:
     """Replace, in place, the names of materials and of MJCF files by their contents."""
-    for grains in data.get("grains") or []:
+    beds = data.get("grains")
+    for grains in beds if isinstance(beds, list) else []:
         if isinstance(grains, dict) and isinstance(grains.get("material"), str):
-            grains["material"] = read_yaml(find("materials", grains["material"]))
+            grains["material"] = read_yaml(find("materials", grains["material"], folder))
     bodies = data.get("bodies")
     if isinstance(bodies, dict) and isinstance(bodies.get("mjcf"), str) and bodies["mjcf"].endswith(".xml"):
-        file = folder / bodies["mjcf"]
+        name = bodies["mjcf"]
+        file = Path(__file__).parent / name.removeprefix(PACKAGE) if name.startswith(PACKAGE) else folder / name
         if not file.is_file():
             raise ValueError(f"bodies.mjcf: there is no file {file}.")
         bodies["mjcf"] = file.read_text(encoding="utf-8")

@@ -79,7 +79,7 @@ def p2g(grid: Grid, p: Particles, dt: float, chunk: int = CHUNK) -> Array:
         x, v, C, tau, m, V0 = lax.optimization_barrier(tuple(map(rows, (p.x, p.v, p.C, p.tau, p.m, p.V0))))
         base, w, r = weights(x, grid.cell_size, grid.shape)
         stress = matrix_rows(tau)
-        force = dt * per_D * V0
+        force = jnp.where(m > 0, dt * per_D * V0, 0)  # an empty slot keeps its last stress: it must push nobody
         q = jnp.stack([*(m * v[i] for i in range(d)), m])
         A = [jnp.stack([*(m * C[i, j] - force * stress[i][j] for i in range(d)), 0 * m]) for j in range(d)]
         # Momentum is linear in the offsets, so it is built axis by axis: (3, .., 3, d + 1, chunk).

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mpm_env import render as pictures
-from mpm_env.render import Camera, camera_for, render, save_png, save_video
+from mpm_env.render import Camera, _rays, camera_for, render, save_png, save_video
+from mpm_env.render_light import SUN
+from mpm_env.render_surface import FAR, see_bodies
 
 WIDTH, HEIGHT = 96, 64
 FLOAT32 = 1e-5  # m at a distance of a few metres: distances are kept in float32
@@ -43,13 +44,13 @@ def heap(n: int = 3000) -> np.ndarray:
 
 
 def test_a_sphere_is_as_far_as_geometry_says():
-    rays = pictures._rays(FRONT, HEIGHT, WIDTH)
-    seen = pictures._bodies(*scene(f'<geom size="{SPHERE}" pos="0.1 0 0.3"/>'), rays, None)
+    rays = _rays(FRONT, HEIGHT, WIDTH)
+    seen = see_bodies(*scene(f'<geom size="{SPHERE}" pos="0.1 0 0.3"/>'), rays, None)
     centre = np.array([0.1, 0, 0.3]) - FRONT.eye
     along = rays.direction.astype(float) @ centre
     inside = along**2 - centre @ centre + SPHERE**2
     clear = np.abs(inside) > 1e-3  # rays that only graze may round either way
-    np.testing.assert_array_equal((seen.distance < pictures.FAR)[clear], (inside > 0)[clear])
+    np.testing.assert_array_equal((seen.distance < FAR)[clear], (inside > 0)[clear])
     hit = (inside > 0) & clear
     assert hit.sum() > 100
     np.testing.assert_allclose(seen.distance[hit], along[hit] - np.sqrt(inside[hit]), atol=FLOAT32)
@@ -58,9 +59,9 @@ def test_a_sphere_is_as_far_as_geometry_says():
 
 
 def test_the_model_s_plane_and_ground_z_are_as_far_as_geometry_says():
-    rays = pictures._rays(FRONT, HEIGHT, WIDTH)
-    plane = pictures._bodies(*scene('<geom type="plane" size="0 0 1"/>'), rays, None).distance
-    ground = pictures._bodies(None, None, rays, 0.0).distance
+    rays = _rays(FRONT, HEIGHT, WIDTH)
+    plane = see_bodies(*scene('<geom type="plane" size="0 0 1"/>'), rays, None).distance
+    ground = see_bodies(None, None, rays, 0.0).distance
     near = rays.direction[:, 2] < -0.05  # below the horizon
     expected = -FRONT.eye[2] / rays.direction[near, 2].astype(float)
     np.testing.assert_allclose(plane[near], expected, rtol=FLOAT32)
@@ -119,7 +120,7 @@ def test_glass_is_seen_through_and_alpha_zero_and_high_groups_are_not_seen():
 
 def test_grains_and_bodies_cast_a_shadow_on_the_ground():
     above = Camera(eye=(0, 0, 3), target=(0, 0, 0), up=(0, 1, 0))
-    foot = np.array([[0.0, 0.0, 0.5]]) - pictures.SUN * 0.5 / pictures.SUN[2]  # where the sun throws (0, 0, 0.5)
+    foot = np.array([[0.0, 0.0, 0.5]]) - SUN * 0.5 / SUN[2]  # where the sun throws (0, 0, 0.5)
     focal = HEIGHT / 2 / np.tan(np.radians(above.fov_deg / 2))
     column, row = int(WIDTH / 2 + focal * foot[0, 0] / 3), int(HEIGHT / 2 - focal * foot[0, 1] / 3)
     ground = '<geom type="plane" size="0 0 1" rgba=".5 .5 .5 1"/>'
@@ -133,7 +134,7 @@ def test_grains_and_bodies_cast_a_shadow_on_the_ground():
 @pytest.mark.parametrize("lower, upper", [((-1, -2, 0), (1, 2, 0.5)), ((0, 0, 0), (0.1, 0, 0.3))])
 def test_camera_for_holds_the_box_and_is_not_far_from_it(lower, upper):
     camera = camera_for(lower, upper)
-    rays = pictures._rays(camera, HEIGHT, WIDTH)
+    rays = _rays(camera, HEIGHT, WIDTH)
     corners = np.stack(np.meshgrid(*np.stack([lower, upper], 1)), -1).reshape(-1, 3) - camera.eye
     x = corners @ rays.basis.T
     reach = np.abs(x[:, :2] * rays.focal / x[:, 2:]) / [WIDTH / 2, HEIGHT / 2]

@@ -1,0 +1,192 @@
+"""The command line: mpm-env run, replay, list."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import sys
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from mpm_env.config import folder, known, read_yaml
+
+DIFFERS, REFUSED, INTERRUPTED = 1, 2, 130  # exit statuses
+FOR_FIDELITY = "fidelity."  # begins the settings that are not the scene's
+KINDS = ("scenes", "tasks", "materials", "fidelities")
+START = """\
+first steps:
+  mpm-env demo dig --out demo_out
+  mpm-env run column_collapse_2d --fidelity draft --out out
+  mpm-env run blade_push --set bodies.friction=0.2 --set fidelity.cells=5 --out out
+  mpm-env replay out/run.rrd --view
+
+exit status: 0 done, 1 a replay differs or a run broke down, 2 refused, 130 interrupted
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Do what the arguments ask; returns the exit status."""
+    options = _parser().parse_args(arguments)
+    try:
+        return int(options.command(options))
+    except KeyboardInterrupt:
+        print("mpm-env: interrupted.", file=sys.stderr)
+        return INTERRUPTED
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="mpm-env",
+        description="Sand and snow that bodies dig into and push, and that push back.",
+        epilog=START,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    for add in COMMANDS:
+        add(commands)
+    return parser
+
+
+def _add_run(commands: Any) -> None:
+    run = commands.add_parser("run", help="simulate a scene into a folder of results", allow_abbrev=False)
+    run.add_argument("scene", metavar="SCENE", help="a name that `mpm-env list` shows, or a .yaml file")
+    run.add_argument("--fidelity", metavar="F", help="a name, or a .yaml file (default: the one that the scene names)")
+    run.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        dest="settings",
+        help="change the scene, as in grains.0.material.E=1e6, or the fidelity, as in fidelity.cells=4; repeatable",
+    )
+    run.add_argument("--seed", type=int, default=0, metavar="N", help="places the grains (default 0)")
+    run.add_argument("--fps", type=float, default=25.0, metavar="HZ", help="frames per simulated second (default 25)")
+    run.add_argument(
+        "--snapshots-fps", type=float, metavar="HZ", help="how often run.npz keeps all grains (default: start and end)"
+    )
+    run.add_argument(
+        "--quantity", default="speed", metavar="Q", help="colours the recording: speed (default), height or material"
+    )
+    run.add_argument("--out", required=True, metavar="DIR", help="folder for run.rrd, run.npz, run.png, summary.json")
+    run.set_defaults(command=_run)
+
+
+def _run(options: argparse.Namespace) -> int:
+    with refusing():
+        from mpm_env.fidelity import load_fidelity
+        from mpm_env.run import FILES, prepare
+        from mpm_env.scene_config import read_scene
+
+        ours = [s.removeprefix(FOR_FIDELITY) for s in options.settings if s.startswith(FOR_FIDELITY)]
+        config = read_scene(options.scene, tuple(s for s in options.settings if not s.startswith(FOR_FIDELITY)))
+        fidelity = load_fidelity(options.fidelity or config.fidelity, ours)
+        use_precision(fidelity.precision)
+        session = prepare(
+            config,
+            fidelity,
+            options.out,
+            seed=options.seed,
+            fps=options.fps,
+            snapshots_fps=options.snapshots_fps,
+            quantity=options.quantity,
+        )
+    summary = session.go(progress=sys.stderr.isatty())
+    for line in report(summary):
+        print(line)
+    print(f"{session.out}: {', '.join(FILES)}")
+    return 0 if summary["ended"] == "complete" else DIFFERS
+
+
+def report(summary: dict[str, Any]) -> Iterator[str]:
+    """A run's summary in a few lines."""
+    numerics, wall, figures = summary["numerics"], summary["wall_s"], summary["figures"]
+    yield f"{summary['scene']}: {figures['simulated_s']:.6g} s simulated, {summary['ended']}"
+    cell_mm, dt_us = 1000 * numerics["cell_size_m"], 1e6 * numerics["mpm_dt_s"]
+    yield f"{numerics['grains']} grains, cells of {cell_mm:.4g} mm, substeps of {dt_us:.3g} us"
+    yield (
+        f"mass {figures['mass_end_kg']:.6g} kg of {figures['mass_start_kg']:.6g} kg,"
+        f" {figures['mass_left_kg']:.4g} kg left the box; top at {figures['top_of_grains_m']:.4g} m"
+    )
+    for name, force in figures["forces_of_grains"].items():
+        yield f"grains on {name}: at most {force['peak_N']:.4g} N, at {force['peak_at_s']:.4g} s"
+    yield (
+        f"{wall['total']:.1f} s of work: {wall['build']:.1f} build, {wall['compile']:.1f} compile,"
+        f" {wall['run']:.1f} run, {wall['log']:.1f} log, {wall['picture']:.1f} picture"
+    )
+    for sentence in summary["health"]["sentences"]:
+        yield f"warning: {sentence}"
+
+
+def _add_replay(commands: Any) -> None:
+    replay = commands.add_parser("replay", help="simulate a recording again and compare", allow_abbrev=False)
+    replay.add_argument("file", metavar="FILE.rrd", help="a recording of mpm-env")
+    replay.add_argument("--view", action="store_true", help="open it in the Rerun viewer as well")
+    replay.set_defaults(command=_replay)
+
+
+def _replay(options: argparse.Namespace) -> int:
+    with refusing():
+        from mpm_env.log import open_viewer, read
+
+        recording = read(options.file)
+        use_precision(recording.recipe.get("fidelity", {}).get("precision", "f32"))
+        if options.view:
+            open_viewer(options.file)
+        from mpm_env.replay import compare
+
+        found = compare(recording, progress=sys.stderr.isatty())
+    for name, (then, now) in found.versions.items():
+        print(f"{name} was {then} when recorded and is {now} now")
+    if not recording.complete:
+        print("the recording was cut short: its whole frames are compared")
+    if found.identical:
+        print(f"identical: the largest difference over {found.frames} frames is 0 m")
+        return 0
+    where = "" if found.at is None else " of the grain at ({:.4g}, {:.4g}, {:.4g}) m".format(*found.at)
+    print(
+        f"different: the largest difference over {found.frames} frames is {found.largest:.3g} m,{where} at"
+        f" {found.time:.6g} s (step {found.step})"
+    )
+    return DIFFERS
+
+
+def _add_list(commands: Any) -> None:
+    listing = commands.add_parser("list", help="scenes, tasks, materials and fidelities that can be named")
+    listing.set_defaults(command=_list)
+
+
+def _list(options: argparse.Namespace) -> int:
+    for kind in KINDS:
+        print(f"{kind}:")
+        for name in known(kind):
+            print(f"  {name:20} {read_yaml(folder() / kind / f'{name}.yaml').get('about', '')}")
+    return 0
+
+
+COMMANDS = (_add_run, _add_replay, _add_list)
+
+
+@contextlib.contextmanager
+def refusing() -> Iterator[None]:
+    """What is wrong in here is the user's to mend: one line, and exit status 2."""
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):  # MJX prints that it lacks a package we do not use
+            import mujoco.mjx  # noqa: F401
+        yield
+    except (ValueError, TypeError, FileNotFoundError, RuntimeError) as error:
+        print(f"mpm-env: {' '.join(str(error).split())}", file=sys.stderr)
+        raise SystemExit(REFUSED) from None
+
+
+def use_precision(precision: str) -> None:
+    """Turn 64-bit JAX on where it is asked for, before anything is built."""
+    if precision == "f64":
+        import jax
+
+        jax.config.update("jax_enable_x64", True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

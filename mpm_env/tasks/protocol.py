@@ -1,0 +1,99 @@
+"""What a task is: a scene, an action that moves its robot, and what is observed and rewarded."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, NamedTuple, Protocol
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from pydantic import Field
+
+from mpm_env.config import Section
+from mpm_env.scene import Scene, State
+from mpm_env.scene_config import SceneConfig
+
+
+class TaskConfig(Section):
+    """A task file: goals in kg, m and s, never in grains, so that every fidelity runs the same task."""
+
+    about: str = ""
+    model: str  # which code in TASKS
+    target_kg: Annotated[float, Field(gt=0)]  # mass to deliver
+    control_dt: Annotated[float, Field(gt=0)] = 0.1  # s between actions
+    time_limit: Annotated[float, Field(gt=0)]  # s, then the episode is truncated
+    scene: SceneConfig
+
+
+class Tool(NamedTuple):
+    """Bodies' answer, over the last action: what the grains did to the tool."""
+
+    force: Array  # (3,) N in world axes, mean over the action
+    torque: Array  # (3,) N m about the tool's wrench site, world axes, mean over the action
+
+
+class Task(Protocol):
+    """A task over one scene. Pure: everything that changes is in the state."""
+
+    config: TaskConfig
+    scene: Scene
+    term_weights: dict[str, float]  # reward = sum of weight times term; weights sum to 1
+    rates: np.ndarray  # (a,) change of the actuator targets per second at full action
+
+    @property
+    def action_size(self) -> int:
+        """Length of an action; each element is in [-1, 1]."""
+
+    def initial(self, key: Array) -> State:
+        """A seeded start."""
+
+    def targets(self, state: State, action: Array) -> Array:
+        """Actuator targets (nu,) that the action (a,) asks for by the end of its time."""
+
+    def observation(self, state: State, tool: Tool) -> dict[str, Array]:
+        """Named observations."""
+
+    def facts(self, state: State) -> dict[str, Array]:
+        """Scalars worth a plot: masses in kg, lengths in m."""
+
+    def terms(self, facts: dict[str, Array], tool: Tool) -> dict[str, Array]:
+        """Reward terms, each in [0, 1]."""
+
+    def success(self, facts: dict[str, Array]) -> Array:
+        """Whether the goal is reached, () bool."""
+
+    def wrench(self, state: State, reaction: Array) -> Tool:
+        """The tool's wrench from the reactions (G, 6) on the coupled geoms."""
+
+    def script(self) -> list[tuple[float, np.ndarray]]:
+        """A scripted solution: (time s, actuator targets (nu,))."""
+
+
+def geom_wrench(scene: Scene, state: State, reaction: Array, site: str) -> Tool:
+    """Force and torque about a site from the reactions (G, 6) on the coupled geoms that share the site's body.
+
+    Reactions come about their body's centre of mass; a wrench about another point gains the lever times the force.
+    """
+    bodies = scene.bodies
+    assert bodies is not None
+    at = bodies.model.site(site)
+    mine = np.asarray([bodies.model.geom_bodyid[g] == at.bodyid[0] for g in bodies.geoms])
+    wrench = jnp.sum(jnp.where(mine[:, None], reaction, 0), axis=0)
+    lever = (state.rigid.xipos[at.bodyid[0]] - state.rigid.site_xpos[at.id]).astype(reaction.dtype)
+    return Tool(wrench[:3], wrench[3:] + jnp.cross(lever, wrench[:3]))
+
+
+def within(x: Array, bound: float) -> Array:
+    """x over its bound, clipped to [0, 1]: the common shape of reward terms."""
+    return jnp.clip(x / bound, 0.0, 1.0)
+
+
+def kilograms(m: Array, where: Array) -> Array:
+    """Mass () in kg of the grains (n,) for which `where` (n,) holds."""
+    return jnp.sum(jnp.where(where, m, 0))
+
+
+def in_body(state: State, body: int, x: Array) -> Array:
+    """Points x (3, n) m of the world in the frame of a body, (3, n) m."""
+    d: Any = state.rigid
+    return d.xmat[body].astype(x.dtype).T @ (x - d.xpos[body].astype(x.dtype)[:, None])

@@ -1,0 +1,256 @@
+"""A rigid step cut in two is MuJoCo's own step, and what grains see of the bodies is where MuJoCo puts them."""
+
+from functools import cache
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from mujoco import mjx
+
+from coupling import bodies as rigid
+from coupling.bodies import Bodies, couple, points_near
+
+STEPS = 50
+# Float32 over 50 steps against MuJoCo's float64; the arm moves with 1 rad/s. 3e-7 and 4e-6 observed.
+ARM_TOLERANCE = {"qpos": 2e-6, "qvel": 2e-5}
+# Two solutions of one equation in float32. 2e-7 observed.
+LANDING_TOLERANCE = 1e-6  # of the fastest
+PLANE_TOLERANCE = 1e-6  # m and m/s over 50 steps of the same arithmetic in float32
+POSE_TOLERANCE = 1e-6  # m and radians, float32
+HELD_TOLERANCE = 1e-3  # m/s
+COUNT_TOLERANCE = 0.15  # of a shell's volume in lattice cells: points are counted on half the spacing
+
+ARM = """
+<mujoco>
+  <option timestep="0.004" integrator="{integrator}"/>
+  <worldbody>
+    <body pos="0 0 1">
+      <joint name="shoulder" axis="0 1 0" damping="4" armature="0.01"/>
+      <geom name="upper" type="capsule" size=".02" fromto="0 0 0 .3 0 0" mass=".3"/>
+      <body pos=".3 0 0">
+        <joint name="elbow" axis="0 1 0" damping="2"/>
+        <geom name="paddle" type="box" size=".02 .06 .05" pos=".1 0 -.05" mass=".5"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><position joint="shoulder" kp="60" kv="1"/><position joint="elbow" kp="30"/></actuator>
+</mujoco>"""
+
+BOX_ON_PLANE = """
+<mujoco>
+  <option timestep="0.004"/>
+  <worldbody>
+    <geom name="floor" type="plane" size="1 1 1"/>
+    <body pos="0 0 .052"><freejoint/><geom name="box" type="box" size=".1 .1 .05" mass="2"/></body>
+  </worldbody>
+</mujoco>"""
+
+TOOL = """
+<mujoco>
+  <option timestep="0.004"/>
+  <worldbody>
+    <body name="tool" mocap="true" pos=".1 .2 .3" quat=".9 .1 -.3 .2">
+      <geom name="blade" type="box" size=".1 .02 .05" pos=".08 0 .1" euler="20 10 5"/>
+      <site name="edge" pos="0 0 .2" euler="30 0 0"/>
+      <body pos="0 .1 0" euler="0 40 0"><geom name="tip" type="sphere" size=".02" pos=".05 0 0" mass="3"/></body>
+    </body>
+    <geom name="floor" type="plane" size="1 1 1"/>
+    <geom name="ball" type="sphere" size=".1" pos="0 0 .5"/>
+  </worldbody>
+</mujoco>"""
+
+
+class Step(NamedTuple):
+    """One rigid step under a load."""
+
+    qpos: jax.Array
+    qvel: jax.Array
+    expected: jax.Array  # (nv,) where the exchange leaves the joint velocities
+    oracle_qpos: jax.Array  # mjx.step's
+    oracle_qvel: jax.Array
+
+
+def model_of(xml: str) -> mujoco.MjModel:
+    return mujoco.MjModel.from_xml_string(xml)
+
+
+def coupled(model: mujoco.MjModel, *names: str) -> Bodies:
+    return couple(model, {model.geom(n).id: 0.4 for n in names})
+
+
+def at_rest(b: Bodies) -> Any:
+    return jax.jit(lambda: rigid.start(b, None, np.zeros(b.model.nu), mocap_poses(b.model)))()
+
+
+def mocap_poses(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
+    ids = [i for i in range(model.nbody) if model.body_mocapid[i] >= 0]
+    return model.body_pos[ids].reshape(-1, 3), model.body_quat[ids].reshape(-1, 4)
+
+
+def run(b: Bodies, control: np.ndarray, impulses: np.ndarray, *, oracle: bool = False) -> Step:
+    """Rigid steps under the grains' impulses (steps, nv); with an oracle, mjx.step under the same beside it."""
+    still = jnp.zeros((len(b.bodies), 6))
+
+    def one(both: tuple[Any, Any], impulse: jax.Array) -> tuple[tuple[Any, Any], Step]:
+        d, twin = both
+        d, stance = rigid.open_step(b, d, still)
+        expected = d.qvel + b.model.opt.timestep * stance.acceleration + jnp.linalg.solve(stance.M, impulse)
+        d = rigid.refresh(b, rigid.close_step(b, d, impulse))
+        if oracle:
+            twin = mjx.step(b.mjx_model, twin.replace(qfrc_applied=impulse / b.model.opt.timestep))
+        return (d, twin), Step(d.qpos, d.qvel, expected, twin.qpos, twin.qvel)
+
+    d = at_rest(b).replace(ctrl=jnp.asarray(control, jnp.float32))
+    return jax.tree.map(np.asarray, jax.jit(lambda d, rows: jax.lax.scan(one, (d, d), rows)[1])(d, impulses))
+
+
+def loads(nv: int, size: float) -> np.ndarray:
+    return (size * np.random.default_rng(0).normal(size=(STEPS, nv))).astype(np.float32)
+
+
+@cache
+def arm_run(integrator: str) -> tuple[Bodies, np.ndarray, Step]:
+    b = coupled(model_of(ARM.format(integrator=integrator)), "paddle")
+    impulses = loads(2, 0.01)
+    return b, impulses, run(b, np.array([0.5, -0.8]), impulses)
+
+
+@cache
+def plane_run() -> Step:
+    """A box that falls 2 mm onto a plane and is pushed down and aside by 30 N all the time."""
+    b = coupled(model_of(BOX_ON_PLANE), "box")
+    push = np.tile(np.array([0.02, 0, -0.12, 0, 0, 0], np.float32), (STEPS, 1))
+    return run(b, np.zeros(0), push, oracle=True)
+
+
+each_integrator = pytest.mark.parametrize("integrator", ["Euler", "implicitfast"])
+
+
+@each_integrator
+def test_an_arm_under_load_moves_as_in_mujoco(integrator: str) -> None:
+    b, impulses, found = arm_run(integrator)
+    data = mujoco.MjData(b.model)
+    data.ctrl[:] = [0.5, -0.8]
+    for k, impulse in enumerate(impulses):
+        data.qfrc_applied[:] = impulse / b.model.opt.timestep
+        mujoco.mj_step(b.model, data)
+        np.testing.assert_allclose(found.qpos[k], data.qpos, rtol=0, atol=ARM_TOLERANCE["qpos"])
+        np.testing.assert_allclose(found.qvel[k], data.qvel, rtol=0, atol=ARM_TOLERANCE["qvel"])
+    assert np.abs(found.qvel).max() > 0.5, "it hardly moved"
+
+
+@each_integrator
+def test_the_integrator_lands_on_the_velocity_of_the_exchange(integrator: str) -> None:
+    found = arm_run(integrator)[2]
+    fastest = np.abs(found.qvel).max()
+    np.testing.assert_allclose(found.qvel, found.expected, rtol=0, atol=LANDING_TOLERANCE * fastest)
+
+
+def test_a_box_on_a_plane_moves_as_by_mjx_step() -> None:
+    found = plane_run()
+    np.testing.assert_allclose(found.qpos, found.oracle_qpos, rtol=0, atol=PLANE_TOLERANCE)
+    np.testing.assert_allclose(found.qvel, found.oracle_qvel, rtol=0, atol=PLANE_TOLERANCE)
+    assert found.qpos[-1, 2] < 0.0501, "it did not reach the plane"
+
+
+def test_a_box_between_grains_and_a_plane_is_held_in_the_exchange_too() -> None:
+    """The plane answers the grains' load while they act, not a step later: 30 N would move 2 kg by 6 cm/s each step."""
+    found = plane_run()
+    np.testing.assert_allclose(found.qvel[-10:], found.expected[-10:], rtol=0, atol=HELD_TOLERANCE)
+
+
+def test_coasting_brings_mocap_bodies_to_their_next_pose() -> None:
+    b = coupled(model_of(TOOL), "blade", "tip", "ball")
+    d = at_rest(b)
+    position, quaternion = np.array([[0.103, 0.201, 0.296]]), np.array([[0.88, 0.13, -0.32, 0.17]])
+    quaternion /= np.linalg.norm(quaternion)
+    substeps = 5
+    h = b.model.opt.timestep / substeps
+
+    @jax.jit
+    def coasted(d: Any) -> tuple[jax.Array, ...]:
+        same_turn = -quaternion  # a quaternion's other sign
+        twist = rigid.drift(b, d, *(jnp.asarray(a, jnp.float32) for a in (position, same_turn)))
+        _, stance = rigid.open_step(b, d, twist)
+        centre, turn = stance.centre, jnp.broadcast_to(jnp.eye(3), (len(b.bodies), 3, 3))
+        for _ in range(substeps):
+            centre, turn = centre + h * twist[:, :3], rigid.turned(turn, twist[:, 3:], h)
+        return twist, stance.centre, *rigid.poses(b, stance, centre, turn)
+
+    twist, start, pos, mat = map(np.asarray, coasted(d))
+    oracle = mujoco.MjData(b.model)
+    oracle.mocap_pos[:], oracle.mocap_quat[:] = position, quaternion
+    mujoco.mj_forward(b.model, oracle)
+    geoms = list(b.geoms)
+    assert np.abs(start[0] - oracle.xipos[b.bodies[0]]).max() > 1e-3, "it hardly moved"
+    np.testing.assert_allclose(pos, oracle.geom_xpos[geoms], rtol=0, atol=POSE_TOLERANCE)
+    np.testing.assert_allclose(mat, oracle.geom_xmat[geoms].reshape(-1, 3, 3), rtol=0, atol=POSE_TOLERANCE)
+    np.testing.assert_array_equal(twist[b.body_of[2]], 0)
+
+
+def test_without_joints_all_that_hangs_on_a_mocap_body_goes_with_it() -> None:
+    b = coupled(model_of(TOOL), "blade")
+    position, quaternion = np.array([[0.3, -0.2, 0.6]]), np.array([[0.5, 0.5, -0.5, 0.5]])
+    oracle = mujoco.MjData(b.model)
+    oracle.mocap_pos[:], oracle.mocap_quat[:] = position, quaternion
+    mujoco.mj_forward(b.model, oracle)
+    d = rigid.refresh(b, rigid.place(at_rest(b), position, 3 * quaternion))  # MuJoCo normalises, and so do we
+    for field in ("xpos", "xmat", "xipos", "ximat", "geom_xpos", "geom_xmat", "site_xpos", "site_xmat"):
+        found, expected = np.asarray(getattr(d, field)), getattr(oracle, field)
+        np.testing.assert_allclose(found, expected.reshape(found.shape), rtol=0, atol=POSE_TOLERANCE, err_msg=field)
+    turned = np.abs(np.sum(np.asarray(d.xquat) * oracle.xquat, axis=1))  # 1 where it is the same turn
+    np.testing.assert_allclose(turned, 1, atol=POSE_TOLERANCE)
+
+
+def test_only_bodies_with_joints_yield() -> None:
+    tool, arm = coupled(model_of(TOOL), "blade", "ball"), coupled(model_of(ARM.format(integrator="Euler")), "paddle")
+    assert not tool.yields
+    assert not tool.steps
+    assert arm.yields
+    assert arm.steps
+
+
+def test_points_near_a_ball_fill_its_shell() -> None:
+    b = coupled(model_of(TOOL), "ball")
+    count = points_near(b, ((-0.02, 0.03),), 0.01)[0]
+    assert count == pytest.approx(4 / 3 * np.pi * (0.13**3 - 0.08**3) / 0.01**3, rel=COUNT_TOLERANCE)
+    flat = points_near(b, ((-0.02, 0.03),), 0.01, middle=0.0)[0]
+    assert flat == pytest.approx(np.pi * (0.13**2 - 0.08**2) / 0.01**2, rel=COUNT_TOLERANCE)
+    assert points_near(b, ((-0.02, 0.03),), 0.01, middle=0.5)[0] <= 1
+
+
+def test_points_near_many_geoms_add_up_and_planes_count_as_none() -> None:
+    model = model_of(TOOL)
+    each = [points_near(coupled(model, n), ((-0.02, 0.02),), 0.01)[0] for n in ("blade", "tip", "floor")]
+    assert each[2] == 0
+    assert points_near(coupled(model, "blade", "tip", "floor"), ((-0.02, 0.02),), 0.01)[0] == sum(each)
+
+
+@pytest.mark.parametrize("integrator", ["implicit", "RK4"])
+def test_an_integrator_that_grains_cannot_join_is_refused(integrator: str) -> None:
+    with pytest.raises(ValueError, match=r"integrator is mjINT_.* choose Euler or implicitfast"):
+        coupled(model_of(ARM.format(integrator=integrator)), "paddle")
+
+
+def test_a_model_that_mjx_cannot_run_is_refused() -> None:
+    model = model_of("""
+        <mujoco><worldbody>
+          <body><freejoint/><geom name="a" type="box" size=".1 .1 .1"/></body>
+          <body pos="1 0 0"><freejoint/><geom name="b" type="cylinder" size=".1 .1"/></body>
+        </worldbody></mujoco>""")
+    with pytest.raises(ValueError, match=r"MJX cannot run this model: .* Remove that feature or those contacts\."):
+        coupled(model, "a")
+
+
+def test_a_joint_below_a_mocap_body_is_refused() -> None:
+    model = model_of("""
+        <mujoco><worldbody>
+          <body mocap="true"><geom type="sphere" size=".1"/>
+            <body name="flap" pos="0 0 1"><joint/><geom name="flap" type="box" size=".1 .1 .1"/></body>
+          </body>
+        </worldbody></mujoco>""")
+    with pytest.raises(ValueError, match=r"'flap' hangs by a joint on a mocap body, .* or no joint"):
+        coupled(model, "flap")
