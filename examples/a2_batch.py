@@ -1,7 +1,6 @@
 """A batch of episodes as one compiled program: the functional form, one friction angle per environment."""
 
 from dataclasses import replace
-from functools import partial
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""The command line: mpm-env run, replay, list."""
+"""The command line: mpm-env run, demo, replay, list."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ first steps:
   mpm-env run blade_push --set bodies.friction=0.2 --set fidelity.cells=5 --out out
   mpm-env replay out/run.rrd --view
 
-exit status: 0 done, 1 a replay differs or a run broke down, 2 refused, 130 interrupted
+exit status: 0 done, 1 a replay differs, a run broke down or a demo missed its goal, 2 refused, 130 interrupted
 """
 
 
@@ -165,7 +165,42 @@ def _list(options: argparse.Namespace) -> int:
     return 0
 
 
-COMMANDS = (_add_run, _add_replay, _add_list)
+DEMOS = {"dig": "dig_sand", "push": "push_sand"}  # short names; any task may be named in full
+
+
+def _add_demo(commands: Any) -> None:
+    demo = commands.add_parser("demo", help="a scripted policy does a task", allow_abbrev=False)
+    demo.add_argument("task", metavar="TASK", help="dig, push, dig_snow, push_snow, or a .yaml file")
+    demo.add_argument("--fidelity", metavar="F", help="a name, or a .yaml file (default: the one that the task names)")
+    demo.add_argument("--seed", type=int, default=0, metavar="N", help="shapes the bed (default 0)")
+    demo.add_argument(
+        "--out", required=True, metavar="DIR", help="folder for demo.rrd, demo.webp, demo.png, summary.json"
+    )
+    demo.set_defaults(command=_demo)
+
+
+def _demo(options: argparse.Namespace) -> int:
+    with refusing():
+        from mpm_env.demo import FILES, prepare
+        from mpm_env.tasks import read_task
+
+        show = prepare(
+            read_task(DEMOS.get(options.task, options.task)), options.fidelity, options.out, seed=options.seed
+        )
+    summary = show.go(progress=sys.stderr.isatty())
+    facts, wall = summary["facts"], summary["wall_s"]
+    outcome = "reached" if summary["success"] else "NOT reached"
+    print(f"{summary['task']}: goal of {summary['target_kg']:g} kg {outcome}, {summary['time_s']:g} s simulated")
+    print(", ".join(f"{k.removesuffix('_kg')} {v:.3g} kg" for k, v in facts.items() if k.endswith("_kg")))
+    print(f"force on the tool: mean {summary['force_mean_N']:.3g} N, peak {summary['force_peak_N']:.3g} N")
+    print(f"{summary['grains']} grains; wall time {', '.join(f'{k} {v:.1f} s' for k, v in wall.items())}")
+    for sentence in summary["health"]["sentences"]:
+        print(f"warning: {sentence}")
+    print(f"{options.out}: {', '.join(FILES)}")
+    return 0 if summary["success"] else DIFFERS
+
+
+COMMANDS = (_add_run, _add_demo, _add_replay, _add_list)
 
 
 @contextlib.contextmanager

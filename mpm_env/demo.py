@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -18,12 +19,11 @@ from mpm_env.log import Recorder
 from mpm_env.render import save_png, save_video
 from mpm_env.run import folder, versions
 from mpm_env.tasks import TaskConfig
-from mpm_env.tasks.episode import Episode, actions_per_episode, scripted_action
+from mpm_env.tasks.episode import actions_per_episode, scripted_action
 from mpm_env.view import View, camera_of, write_frame
 
 FILES = ("demo.rrd", "demo.webp", "demo.png", "summary.json")
-PICTURE = {"width": 480, "height": 320}  # pixels
-STILL = {"width": 960, "height": 640, "samples": 2}
+SKIP = 2  # actions per frame of the moving picture
 SETTLE = 5  # actions after the script's end, for what still falls
 
 
@@ -37,88 +37,116 @@ def demo(
 ) -> dict[str, Any]:
     """Follow a task's script for one episode; leave demo.rrd, demo.webp, demo.png and summary.json in `out`.
 
-    Returns the summary. The episode runs to the end of its script, past the moment of success, so that what is delivered
-    can come to rest. Raises ValueError, in one sentence, for what cannot be simulated; nothing is written then.
+    Returns the summary. The episode runs to the end of its script, past success, so that what is delivered can come to
+    rest. Raises ValueError, in one sentence, for what cannot be simulated; nothing is written then.
     """
+    return prepare(task, fidelity, out, seed=seed).go(progress=progress)
+
+
+def prepare(
+    task: str | TaskConfig, fidelity: str | Fidelity | None, out: str | os.PathLike[str], *, seed: int = 0
+) -> Demo:
+    """A demo that is ready to go: everything that can be refused has been checked. Arguments as for `demo`."""
     began = perf_counter()
-    env = GrainsEnv(task, fidelity, render_mode="rgb_array")
-    scene = env.task.scene
+    env = GrainsEnv(task, fidelity)
+    if seed < 0:
+        raise ValueError(f"seed = {seed} is negative: use 0 or more.")
     path = folder(out, FILES)
-    built = perf_counter() - began
-    env.reset(seed=seed)
-    box, camera = scene.config.box, camera_of(scene)
-    assert env.episode is not None and scene.bodies is not None
-    count = min(round(env.task.script()[-1][0] / env.task.config.control_dt) + SETTLE, actions_per_episode(env.task))
-    frames: list[np.ndarray] = []
-    rewards: list[float] = []
-    forces: list[float] = []
-    best, still = 0.0, None
-    wall = {"build": built, "compile": 0.0, "run": 0.0, "log": 0.0}
-    recipe = {
-        "kind": "task",
-        "scene": scene.config.name,
-        "seed": seed,
-        "key": env.key_number,
-        "config": env.task.config.model_dump(mode="json"),
-        "fidelity": scene.fidelity.model_dump(mode="json"),
-        "versions": versions(),
-    }
-    with Recorder(
-        path / "demo.rrd",
-        recipe=recipe,
-        model=scene.bodies.model,
-        box=(box.lower, box.upper),
-        view=(camera.eye, camera.target),
-    ) as recorder:
-        _frame(recorder, env, env.episode)
-        for k in tqdm(range(count), unit="action", disable=not progress):
-            action = scripted_action(env.task, env.episode)
-            recorder.action(int(env.episode.state.steps), action.astype(np.float64))
-            started = perf_counter()
-            _, reward, _, _, info = env.step(action)
-            wall["compile" if k == 0 else "run"] += perf_counter() - started
-            started = perf_counter()
-            rewards.append(reward)
-            forces.append(float(np.linalg.norm(info["force_N"])))
-            _frame(recorder, env, env.episode)
-            view = View.of(scene, env.episode.state)
-            frames.append(view.picture(**PICTURE))
-            interest = sum(info["terms"].values())
-            if interest > best:
-                best, still = interest, view
-            wall["log"] += perf_counter() - started
-    save_video(path / "demo.webp", frames, round(1 / env.task.config.control_dt))
-    if still is not None:
-        save_png(path / "demo.png", still.picture(**STILL))
-    facts = {k: float(v) for k, v in env.episode.facts.items()}
-    health = int(env.episode.state.health)
-    summary = {
-        "task": scene.config.name,
-        "success": bool(env.episode.terminated),
-        "target_kg": env.task.config.target_kg,
-        "facts": facts,
-        "return": float(np.sum(rewards)),
-        "force_mean_N": float(np.mean(forces)),
-        "force_peak_N": float(np.max(forces)),
-        "time_s": count * env.task.config.control_dt,
-        "grains": int(np.count_nonzero(np.asarray(env.episode.state.grains.m))),
-        "health": {"names": names(health), "sentences": sentences(health)},
-        "wall_s": wall,
-        "seed": seed,
-        "fidelity": scene.fidelity.model_dump(mode="json"),
-        "versions": versions(),
-    }
-    (path / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
-    return summary
+    return Demo(env, path, seed, perf_counter() - began)
 
 
-def _frame(recorder: Recorder, env: GrainsEnv, e: Episode) -> None:
-    """One frame of the recording: the state, the tool's wrench, reward terms and masses."""
-    scene = env.task.scene
-    scalars = {f"reward/{k}": float(v) for k, v in e.terms.items()}
-    scalars |= {"reward/total": float(e.reward)}
-    scalars |= {f"budget/{k.replace('_kg', '_mass_kg')}": float(v) for k, v in e.facts.items() if k.endswith("_kg")}
-    scalars |= {f"place/{k}": float(v) for k, v in e.facts.items() if k.endswith("_m")}
+@dataclass(eq=False)
+class Demo:
+    """A scripted episode, built and about to start."""
+
+    env: GrainsEnv
+    out: Path
+    seed: int
+    build_s: float
+
+    def go(self, *, progress: bool = True) -> dict[str, Any]:
+        """Run it, write the files, return the summary."""
+        env, scene = self.env, self.env.task.scene
+        dt = env.task.config.control_dt
+        wall = {"build": self.build_s, "compile": 0.0, "run": 0.0, "log": 0.0}
+        started = perf_counter()
+        env.reset(seed=self.seed)
+        wall["compile"] += perf_counter() - started
+        count = min(round(env.task.script()[-1][0] / dt) + SETTLE, actions_per_episode(env.task))
+        views: list[View] = []
+        rewards, forces, interest = [], [], []
+        with self._recorder() as recorder:
+            _frame(recorder, env)
+            for k in tqdm(range(count), unit="action", disable=not progress):
+                assert env.episode is not None
+                action = scripted_action(env.task, env.episode)
+                recorder.action(int(env.episode.state.steps), action.astype(np.float64))
+                started = perf_counter()
+                _, reward, _, _, info = env.step(action)
+                wall["compile" if k == 0 else "run"] += perf_counter() - started
+                started = perf_counter()
+                rewards.append(reward)
+                forces.append(float(np.linalg.norm(info["force_N"])))
+                interest.append(sum(info["terms"].values()))
+                _frame(recorder, env)
+                views.append(View.of(scene, env.episode.state))
+                wall["log"] += perf_counter() - started
+        started = perf_counter()
+        save_video(self.out / "demo.webp", [v.picture() for v in views[::SKIP]], 1 / (SKIP * dt))
+        save_png(self.out / "demo.png", views[int(np.argmax(interest))].picture(width=960, height=640, samples=2))
+        wall["pictures"] = perf_counter() - started
+        e = env.episode
+        assert e is not None
+        summary = {
+            "task": scene.config.name,
+            "success": bool(e.terminated),
+            "target_kg": env.task.config.target_kg,
+            "facts": {k: float(v) for k, v in e.facts.items()},
+            "return": float(np.sum(rewards)),
+            "force_mean_N": float(np.mean(forces)),
+            "force_peak_N": float(np.max(forces)),
+            "time_s": count * dt,
+            "grains": int(np.count_nonzero(np.asarray(e.state.grains.m))),
+            "health": {"names": names(int(e.state.health)), "sentences": sentences(int(e.state.health))},
+            "wall_s": wall,
+            "seed": self.seed,
+            "fidelity": scene.fidelity.model_dump(mode="json"),
+            "versions": versions(),
+        }
+        (self.out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+        return summary
+
+    def _recorder(self) -> Recorder:
+        """The recording, open, with all that a re-simulation needs."""
+        scene = self.env.task.scene
+        assert scene.bodies is not None
+        box, camera = scene.config.box, camera_of(scene)
+        recipe = {
+            "kind": "task",
+            "scene": scene.config.name,
+            "seed": self.seed,
+            "key": self.env.key_number,
+            "config": self.env.task.config.model_dump(mode="json"),
+            "fidelity": scene.fidelity.model_dump(mode="json"),
+            "versions": versions(),
+        }
+        return Recorder(
+            self.out / "demo.rrd",
+            recipe=recipe,
+            model=scene.bodies.model,
+            box=(box.lower, box.upper),
+            view=(camera.eye, camera.target),
+        )
+
+
+def _frame(recorder: Recorder, env: GrainsEnv) -> None:
+    """One frame of the recording: the state, the tool's wrench, reward terms, masses and places."""
+    e, scene = env.episode, env.task.scene
+    assert e is not None
+    scalars = {f"reward/{k}": float(v) for k, v in e.terms.items()} | {"reward/total": float(e.reward)}
+    for k, v in e.facts.items():
+        group, unit = ("budget", "kg") if k.endswith("_kg") else ("place", "m")
+        scalars[f"{group}/{'mass_' if unit == 'kg' else ''}{k}"] = float(v)
     write_frame(
         recorder,
         View.of(scene, e.state),

@@ -62,7 +62,8 @@ class GrainsEnv(gym.Env[dict[str, np.ndarray], np.ndarray]):
         self.task = make_task(task, fidelity)
         self.render_mode = render_mode
         self.metadata = {**type(self).metadata, "render_fps": round(1 / self.task.config.control_dt)}
-        self.observation_space, self.action_space = spaces(self.task)
+        observation_space, self._actions = spaces(self.task)
+        self.observation_space, self.action_space = observation_space, self._actions  # type: ignore[assignment]
         self._reset = jax.jit(partial(reset, self.task))
         self._step = jax.jit(partial(step, self.task))
         self.episode: Episode | None = None  # what the last call left, for logs and for the curious
@@ -81,10 +82,10 @@ class GrainsEnv(gym.Env[dict[str, np.ndarray], np.ndarray]):
         """One action. Raises ValueError for a bad action, RuntimeError before the first reset."""
         if self.episode is None:
             raise RuntimeError("Call reset() before step().")
-        self.episode = e = self._step(self.episode, jnp.asarray(checked(action, self.action_space)))
+        self.episode = e = self._step(self.episode, jnp.asarray(checked(action, self._actions)))
         return _host(e.observation), float(e.reward), bool(e.terminated), bool(e.truncated), self._info(e)
 
-    def render(self) -> np.ndarray | None:  # type: ignore[override]
+    def render(self) -> np.ndarray | None:
         """An RGB image (320, 480, 3) uint8 in render mode rgb_array."""
         if self.render_mode is None or self.episode is None:
             return None
@@ -197,4 +198,3 @@ class GrainsVectorEnv(gym.vector.VectorEnv[dict[str, np.ndarray], np.ndarray, np
 def _host(tree: dict[str, Array]) -> dict[str, np.ndarray]:
     """Arrays as fresh, writable numpy ones."""
     return {k: np.array(v) for k, v in sorted(tree.items())}
-

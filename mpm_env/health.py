@@ -26,13 +26,13 @@ class Health(IntFlag):
 SENTENCES: dict[Health, str] = {
     Health.NOT_FINITE: "A grain or a body has a value that is not finite: the run is lost from here on.",
     Health.LEFT_GRID: "A grain went through a closed wall and left the grid: the time step is too long for its speed.",
-    Health.TOO_FAST: "A grain crossed more than half a cell in one substep: use a smaller courant or a lower speed.",
+    Health.TOO_FAST: "A grain crossed over half a cell in one substep: use a smaller courant or a lower speed.",
     Health.INVERTED: "A grain's velocity gradient would turn it inside out in one substep: use a smaller courant.",
-    Health.TOO_DEEP: "A grain stands more than half a cell inside a body: the tool is too thin or too fast for the cells.",
+    Health.TOO_DEEP: "A grain stands more than half a cell inside a body: the tool is too thin or too fast for them.",
     Health.NODES_OVERFLOW: "More grid nodes are near bodies than were set aside: contact is incomplete.",
     Health.GRAINS_OVERFLOW: "More grains are near bodies than were set aside: contact is incomplete.",
     Health.NOT_CONVERGED: "Contact between grains and bodies was not solved: raise contact_iterations.",
-    Health.BODY_TOO_FAST: "A coupled body moved more than a quarter of a cell in one rigid step: use a smaller rigid_dt.",
+    Health.BODY_TOO_FAST: "A coupled body moved over a quarter of a cell in one rigid step: use a smaller rigid_dt.",
 }
 
 

@@ -128,8 +128,7 @@ class Ledger:
     def _of_grains(self, state: State) -> dict[str, Any]:
         scene = self.scene
         sums = jax.tree.map(partial(np.asarray, dtype=np.float64), self._budgets(state))
-        origin = np.zeros(3)
-        origin[[0, 2] if scene.dimension == 2 else [0, 1, 2]] = scene.grid.origin
+        origin = np.insert(scene.grid.origin, 1, scene.middle) if scene.dimension == 2 else scene.grid.origin
         momentum = _in_space(sums.momentum[:, None], scene)[0]
         turning = sums.angular_momentum
         if scene.dimension == 2:  # the plane's (x, z) turn about minus y

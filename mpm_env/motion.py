@@ -46,7 +46,8 @@ class Motion:
         )
         positions, turns = [], []
         for i, name in enumerate(names):
-            points = config.motion.get(name) or [Waypoint(t=0, position=tuple(map(float, mocap[i].pos)))]
+            x, y, z = map(float, mocap[i].pos)
+            points = config.motion.get(name) or [Waypoint(t=0, position=(x, y, z))]
             positions.append(_curve([(w.t, w.position) for w in points], name))
             turns.append(_turn(points, np.asarray(mocap[i].quat), name))
         times = [t for path in config.controls.values() for t, _ in path]

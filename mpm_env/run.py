@@ -45,9 +45,11 @@ class Rhythm(NamedTuple):
 def rhythm_of(scene: Scene, fps: float, snapshots_fps: float | None = None) -> Rhythm:
     """Frames of a run at fps, in Hz. Raises ValueError where they are no whole numbers of rigid steps."""
     dt, duration = scene.rigid_dt, scene.config.duration
-    per_frame = _whole(1 / (fps * dt)) if 0 < fps < math.inf else None
+    if not 0 < fps < math.inf:
+        raise ValueError(f"fps = {fps:.6g} is no number of frames per second: use 25 or so.")
+    per_frame = _whole(1 / (fps * dt))
     if per_frame is None:
-        at_most = max(math.floor(1 / (max(fps, 1e-9) * dt)), 1)
+        at_most = max(math.floor(1 / (fps * dt)), 1)
         raise ValueError(
             f"A frame at fps = {fps:.6g} is not a whole number of rigid steps of {dt:.6g} s: use fps ="
             f" {1 / (at_most * dt):.6g}."
@@ -58,8 +60,8 @@ def rhythm_of(scene: Scene, fps: float, snapshots_fps: float | None = None) -> R
             f"duration = {duration:.6g} s is {duration * fps:.4g} frames at fps = {fps:.6g}: make it a whole"
             f" number, such as {max(round(duration * fps), 1) / fps:.6g} s."
         )
-    per_snapshot = _whole(fps / snapshots_fps) if snapshots_fps else None
-    if snapshots_fps is not None and per_snapshot is None:
+    per_snapshot = None
+    if snapshots_fps is not None and not (snapshots_fps > 0 and (per_snapshot := _whole(fps / snapshots_fps))):
         raise ValueError(
             f"snapshots_fps = {snapshots_fps:.6g} does not divide fps = {fps:.6g}: use {fps:.6g} or half of it."
         )

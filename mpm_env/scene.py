@@ -22,15 +22,16 @@ from mpm_env.fidelity import Fidelity
 from mpm_env.health import MOST_TRAVEL
 from mpm_env.motion import Motion
 from mpm_env.mpm import seeding
-from mpm_env.mpm.materials import MATERIALS, Material
+from mpm_env.mpm.materials import Material
 from mpm_env.mpm.stability import courant_limit, largest_dt
 from mpm_env.mpm.substep import Bed
 from mpm_env.mpm.transfer import CHUNK
 from mpm_env.mpm.types import MARGIN, Grid, Particles, Wall
-from mpm_env.scene_config import BodiesConfig, BoxFill, MaterialConfig, SceneConfig, SphereFill, Vec3
+from mpm_env.scene_config import BodiesConfig, SceneConfig, Vec3
+from mpm_env.scene_grains import WHOLE, axes_of, fill_of, material_of
 
-WHOLE = 1e-6  # how far from a whole number a ratio of two lengths or times may be, for rounding in the inputs
 CROWDED = 1.5  # grains near a tool may be packed this much denser than at the start
+ICE = 917.0  # kg/m^3, beyond which no snow is packed
 ROOM = 1.3  # how many more nodes than counted at the start may be near a tool, for how it turns and lies in the grid
 OVERLAP = 0.25  # cells that a grain may start inside a body: the jitter of seeding, not a mistake
 
@@ -119,8 +120,8 @@ def build(config: SceneConfig, fidelity: Fidelity) -> Scene:
         fidelity = fidelity.model_copy(update={"dimension": 2})
     grid = _grid(config, fidelity)
     d = grid.dimension
-    materials = tuple(_material(g.material, fidelity, dtype) for g in config.grains)
-    fills = tuple(tuple(_fill(f, config, grid, fidelity) for f in g.fill) for g in config.grains)
+    materials = tuple(material_of(g.material, fidelity, dtype) for g in config.grains)
+    fills = tuple(tuple(fill_of(f, config, grid, fidelity) for f in g.fill) for g in config.grains)
     spans, at = [], 0
     for some in fills:
         count = sum(len(f.sites) for f in some)
@@ -139,13 +140,13 @@ def build(config: SceneConfig, fidelity: Fidelity) -> Scene:
         materials=materials,
         spans=tuple(spans),
         fills=fills,
-        gravity=np.asarray(config.gravity)[_axes(d)],
+        gravity=np.asarray(config.gravity)[axes_of(d)],
         rigid_dt=fidelity.rigid_dt,
         mpm_dt=fidelity.rigid_dt / mpm_per_rigid,
         mpm_per_rigid=mpm_per_rigid,
         bodies=bodies,
         motion=motion,
-        sizes=_sizes(bodies, grid, fidelity, at, middle) if bodies else Sizes(0, 0),
+        sizes=_sizes(bodies, grid, config, fidelity, at, middle) if bodies else Sizes(0, 0),
         middle=middle,
         dtype=dtype,
     )
@@ -196,7 +197,9 @@ def initial(scene: Scene, key: Array, *, qpos: Array | None = None) -> State:
     rigid = None
     if scene.bodies is not None:
         at = qpos if qpos is not None else _keyframe_qpos(scene)
-        rigid = start(scene.bodies, at, scene.motion.control(0.0), scene.motion.mocap(0.0))
+        position, turn = scene.motion.mocap(0.0)
+        control = jnp.asarray(scene.motion.control(0.0))
+        rigid = start(scene.bodies, at, control, (jnp.asarray(position), jnp.asarray(turn)))
     geoms = len(scene.bodies.geoms) if scene.bodies else 0
     state = State(
         rigid=rigid,
@@ -209,11 +212,6 @@ def initial(scene: Scene, key: Array, *, qpos: Array | None = None) -> State:
     )
     # MJX commits its arrays to a device. The others go along, or the first step would compile a second time.
     return jax.device_put(state, jax.devices()[0])
-
-
-def _axes(d: int) -> list[int]:
-    """The world axes that a grid of d dimensions has: x and z in plane strain."""
-    return [0, 2] if d == 2 else [0, 1, 2]
 
 
 def _dtype(fidelity: Fidelity) -> Any:
@@ -232,7 +230,7 @@ def _whole(ratio: float) -> int | None:
 
 
 def _grid(config: SceneConfig, fidelity: Fidelity) -> Grid:
-    axes = _axes(fidelity.dimension)
+    axes = axes_of(fidelity.dimension)
     dx = config.feature / fidelity.cells
     cells = []
     for a in axes:
@@ -240,75 +238,24 @@ def _grid(config: SceneConfig, fidelity: Fidelity) -> Grid:
         n = _whole(side / dx)
         if n is None:
             raise ValueError(
-                f"The box is {side:.6g} m along {'xyz'[a]}, which is {side / dx:.4g} cells of {dx:.6g} m: make it a whole"
-                f" number, with cells = {_fitting_cells(config, fidelity)} or a box of {max(round(side / dx), 1) * dx:.6g} m."
+                f"The box is {side:.6g} m along {'xyz'[a]}, which is {side / dx:.4g} cells of {dx:.6g} m: make it a"
+                f" whole number, with cells = {_fitting_cells(config, fidelity)} or a box of"
+                f" {max(round(side / dx), 1) * dx:.6g} m."
             )
         cells.append(n)
-    walls = [
-        tuple(
-            Wall(w.kind, w.friction) if (w := config.walls.get(f"{'xyz'[a]}_{side}")) else Wall()
-            for side in ("lower", "upper")
-        )
-        for a in axes
-    ]
+    walls = [(_wall(config, f"{'xyz'[a]}_lower"), _wall(config, f"{'xyz'[a]}_upper")) for a in axes]
     return Grid(tuple(config.box.lower[a] for a in axes), tuple(cells), dx, tuple(walls))
+
+
+def _wall(config: SceneConfig, side: str) -> Wall:
+    return Wall(w.kind, w.friction) if (w := config.walls.get(side)) else Wall()
 
 
 def _fitting_cells(config: SceneConfig, fidelity: Fidelity) -> str:
     """Numbers of cells per feature near the one asked for that cut every side of the box into whole cells."""
-    sides = [config.box.upper[a] - config.box.lower[a] for a in _axes(fidelity.dimension)]
+    sides = [config.box.upper[a] - config.box.lower[a] for a in axes_of(fidelity.dimension)]
     fits = [n for n in range(2, 200) if all(_whole(s * n / config.feature) for s in sides)]
     return " or ".join(map(str, sorted(fits, key=lambda n: abs(n - fidelity.cells))[:2])) or "none (change the box)"
-
-
-def _material(config: MaterialConfig, fidelity: Fidelity, dtype: Any) -> Material:
-    values = config.model_dump(exclude={"model", "about"})
-    if config.model == "sand":  # its strength is friction; snow yields at critical strains, so E is its strength
-        values["E"] *= fidelity.stiffness
-    if "friction_deg" in values:
-        values["friction"] = math.radians(values.pop("friction_deg"))
-    leaves = {k: v if isinstance(v, str | bool) else jnp.asarray(v, dtype) for k, v in values.items()}
-    return MATERIALS[config.model](**leaves)
-
-
-def _fill(fill: Any, config: SceneConfig, grid: Grid, fidelity: Fidelity) -> seeding.Fill:
-    axes = _axes(grid.dimension)
-    common = {
-        "target": grid.cell_size / fidelity.particles_per_axis,
-        "thickness": config.box.upper[1] - config.box.lower[1] if grid.dimension == 2 else 1.0,
-        "velocity": tuple(fill.velocity[a] for a in axes),
-    }
-    if isinstance(fill, BoxFill):
-        relief = seeding.Relief(fill.relief.height, fill.relief.wavelength) if fill.relief else None
-        low, high = np.asarray(fill.lower), np.asarray(fill.upper)
-        if not (low < high).all():
-            raise ValueError(f"A box of grains needs lower < upper on every axis, got {fill.lower} and {fill.upper}.")
-        # In plane strain the slice has the box's thickness: a bed narrower than the box has as much less mass in it.
-        if grid.dimension == 2:
-            common["thickness"] = fill.upper[1] - fill.lower[1]
-        made = seeding.fill_box(low[axes], high[axes], relief=relief, **common)
-        reach = (low, np.asarray([*high[:2], high[2] + (3 * relief.height if relief else 0)]))
-    elif isinstance(fill, SphereFill):
-        centre = np.asarray(fill.centre)
-        made = seeding.fill_ball(centre[axes], fill.radius, **common)
-        reach = (centre - fill.radius, centre + fill.radius)
-    else:
-        base, side = np.asarray(fill.base), np.asarray([fill.radius, fill.radius, 0])
-        made = seeding.fill_cylinder(base[axes], fill.radius, fill.height, **common)
-        reach = (base - side, base + side + np.asarray([0, 0, fill.height]))
-    for a in axes:
-        low, high = config.box.lower[a], config.box.upper[a]
-        if reach[0][a] < low - WHOLE or reach[1][a] > high + WHOLE:
-            raise ValueError(
-                f"A {fill.shape} of grains reaches from {reach[0][a]:.6g} to {reach[1][a]:.6g} m along {'xyz'[a]}, outside"
-                f" the simulated box from {low:.6g} to {high:.6g} m: move it or enlarge the box."
-            )
-    if not len(made.sites):
-        raise ValueError(
-            f"A {fill.shape} of grains is smaller than the distance {common['target']:.3g} m of two grains and would stay"
-            " empty: enlarge it or raise the fidelity's cells."
-        )
-    return made
 
 
 def _model(bodies: BodiesConfig, fidelity: Fidelity, gravity: Vec3) -> mujoco.MjModel:
@@ -337,7 +284,7 @@ def _coupled(bodies: BodiesConfig, model: mujoco.MjModel) -> dict[int, float]:
     return out
 
 
-def _keyframe_qpos(scene: Scene) -> np.ndarray | None:
+def _keyframe_qpos(scene: Scene) -> Array | None:
     assert scene.bodies is not None and scene.config.bodies is not None
     model, name = scene.bodies.model, scene.config.bodies.keyframe
     if name is None:
@@ -345,7 +292,7 @@ def _keyframe_qpos(scene: Scene) -> np.ndarray | None:
     known = [model.key(i).name for i in range(model.nkey)]
     if name not in known:
         raise ValueError(f"The model has no keyframe {name!r}{nearest(name, known)}")
-    return np.asarray(model.key(name).qpos)
+    return jnp.asarray(model.key(name).qpos)
 
 
 def _substeps(config: SceneConfig, f: Fidelity, grid: Grid, materials: tuple[Material, ...], motion: Motion) -> int:
@@ -357,8 +304,9 @@ def _substeps(config: SceneConfig, f: Fidelity, grid: Grid, materials: tuple[Mat
     bound = largest_dt(materials, grid.cell_size, grid.dimension, speed)
     if tool * f.rigid_dt > MOST_TRAVEL * grid.cell_size:
         raise ValueError(
-            f"rigid_dt = {f.rigid_dt:.4g} s lets a tool of {tool:.3g} m/s move {tool * f.rigid_dt / grid.cell_size:.2g} cells"
-            f" in one rigid step: use <= {MOST_TRAVEL * grid.cell_size / tool:.3g} s or a slower tool."
+            f"rigid_dt = {f.rigid_dt:.4g} s lets a tool of {tool:.3g} m/s move"
+            f" {tool * f.rigid_dt / grid.cell_size:.2g} cells in one rigid step:"
+            f" use <= {MOST_TRAVEL * grid.cell_size / tool:.3g} s or a slower tool."
         )
     wave = max((float(m.wave_speed()) for m in materials), default=0.0)
     if f.mpm_dt is not None:
@@ -370,8 +318,8 @@ def _substeps(config: SceneConfig, f: Fidelity, grid: Grid, materials: tuple[Mat
         n = _whole(f.rigid_dt / f.mpm_dt)
         if n is None:
             raise ValueError(
-                f"rigid_dt = {f.rigid_dt:.6g} s is {f.rigid_dt / f.mpm_dt:.4g} substeps of mpm_dt = {f.mpm_dt:.6g} s: make it"
-                f" a whole number, with mpm_dt = {f.rigid_dt / math.ceil(f.rigid_dt / f.mpm_dt):.6g}."
+                f"rigid_dt = {f.rigid_dt:.6g} s is {f.rigid_dt / f.mpm_dt:.4g} substeps of mpm_dt = {f.mpm_dt:.6g} s:"
+                f" make it a whole number, with mpm_dt = {f.rigid_dt / math.ceil(f.rigid_dt / f.mpm_dt):.6g}."
             )
         return n
     limit = min((courant_limit(float(m.nu), grid.dimension) for m in materials), default=f.courant)
@@ -384,15 +332,17 @@ def _substeps(config: SceneConfig, f: Fidelity, grid: Grid, materials: tuple[Mat
     return math.ceil(f.rigid_dt / longest - WHOLE)
 
 
-def _sizes(bodies: Bodies, grid: Grid, f: Fidelity, slots: int, middle: float) -> Sizes:
+def _sizes(bodies: Bodies, grid: Grid, config: SceneConfig, f: Fidelity, slots: int, middle: float) -> Sizes:
     """Room for the nodes and grains near bodies: their shells' volume, MOST_TRAVEL added for one rigid step."""
+    snow = [ICE / g.material.rho for g in config.grains if g.material.model == "snow"]
+    crowded = max([CROWDED, *snow])
     dx = grid.cell_size
     slice_at = middle if grid.dimension == 2 else None
     infinite = any(not np.isfinite(s.size[0]) or s.kind == int(mujoco.mjtGeom.mjGEOM_PLANE) for s in bodies.shapes)
     bands = (-NODE_DEPTH * dx, (f.contact_band + MOST_TRAVEL) * dx), (-MOST_TRAVEL * dx, MOST_TRAVEL * dx)
     shell, near = points_near(bodies, bands, dx, middle=slice_at)
     nodes = grid.nodes if infinite else min(grid.nodes, int(ROOM * shell) + 64)
-    grains = slots if infinite else min(slots, int(CROWDED * near * f.particles_per_axis**grid.dimension) + 64)
+    grains = slots if infinite else min(slots, int(crowded * near * f.particles_per_axis**grid.dimension) + 64)
     return Sizes(nodes, grains if f.push_out else 0)
 
 
@@ -416,8 +366,8 @@ def _refuse_overlap(scene: Scene) -> None:
     if phi[worst] < -OVERLAP * scene.grid.cell_size:
         inside = int(np.count_nonzero(phi < -OVERLAP * scene.grid.cell_size))
         raise ValueError(
-            f"{inside} grains start inside the geom {scene.bodies.names[int(geom[worst])]!r}, up to {-phi[worst]:.3g} m deep:"
-            " move the body or the material apart."
+            f"{inside} grains start inside the geom {scene.bodies.names[int(geom[worst])]!r},"
+            f" up to {-phi[worst]:.3g} m deep: move the body or the material apart."
         )
 
 
@@ -428,4 +378,4 @@ def inside_grid(grid: Grid, x: Array) -> Array:
     return jnp.all((s >= 0.5) & (s < last), axis=0)
 
 
-__all__ = ["MARGIN", "Scene", "State", "build", "initial", "inside_grid", "lift"]
+__all__ = ["MARGIN", "WHOLE", "Scene", "State", "build", "initial", "inside_grid", "lift"]

@@ -57,7 +57,7 @@ class SandConfig(Section):
     nu: Annotated[float, Field(ge=0, lt=0.5)]
     rho: Positive  # kg/m^3
     friction_deg: Annotated[float, Field(ge=0, lt=90)]
-    friction_fit: Literal["triaxial", "plane_strain", "mc2d"] = "triaxial"
+    friction_fit: Literal["triaxial", "plane_strain"] = "triaxial"
     cohesion: NotNegative = 0.0  # Pa
     volume_correction: bool = True
 

@@ -46,7 +46,7 @@ def scripted(scene: Scene, first: int, count: int) -> Drive:
         positions.append(position)
         turns.append(turn)
     dtype = np.float64 if jax.config.jax_enable_x64 else np.float32
-    return Drive(*(np.asarray(rows, dtype) for rows in (controls, positions, turns)))
+    return Drive(*(jnp.asarray(np.asarray(rows), dtype) for rows in (controls, positions, turns)))
 
 
 def advance(scene: Scene, state: State, drives: Drive) -> tuple[State, Array]:

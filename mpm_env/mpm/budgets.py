@@ -27,8 +27,8 @@ class Budgets(NamedTuple):
 def budgets(grid: Grid, beds: tuple[Bed, ...], p: Particles, gravity: Array) -> Budgets:
     """Budgets of the grains.
 
-    A grain carries the affine field v + C (x - x_p) with the kernel's inertia D = dx^2/4, so angular momentum and kinetic
-    energy have an affine part each (J15 section 5.3; without it APIC seems to lose angular momentum).
+    A grain carries the affine field v + C (x - x_p) with the kernel's inertia D = dx^2/4, so angular momentum and
+    kinetic energy have an affine part each (J15 section 5.3; without it APIC seems to lose angular momentum).
     """
     D = grid.cell_size**2 / 4
     d = grid.dimension

@@ -92,7 +92,7 @@ def scatter(fill: Fill, key: Array, dtype: jnp.dtype) -> tuple[Array, Array]:
     sites = jnp.asarray(fill.sites.T, dtype)
     spacing = jnp.asarray(fill.spacing, dtype)[:, None]
     x = sites + spacing * jax.random.uniform(key_jitter, sites.shape, dtype, -JITTER, JITTER)
-    if fill.relief is None:
+    if fill.relief is None or fill.top is None:
         return x, jnp.ones(sites.shape[1:], bool)
     return x, sites[-1] < fill.top + relief_height(fill.relief, sites[:-1], key_relief)
 

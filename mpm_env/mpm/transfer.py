@@ -1,14 +1,15 @@
 """Scatter to the grid and gather from it: quadratic B-splines, APIC, MLS-MPM (J15, H18).
 
 The only module that knows how grains are walked through: in chunks of CHUNK, small enough for a chunk's window of
-3^d nodes per grain to stay in cache, with ONE window scatter and ONE window gather per chunk. On XLA:CPU that is five to
-ten times faster than a scatter per node. Grid arrays are `(*shape, channels)`.
+3^d nodes per grain to stay in cache, with ONE window scatter and ONE window gather per chunk. On XLA:CPU that is five
+to ten times faster than a scatter per node. Grid arrays are `(*shape, channels)`.
 """
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
+from typing import TypeVar
 
 import jax.numpy as jnp
 from jax import Array, lax
@@ -55,7 +56,10 @@ def _product(w: list[list[Array]], node: tuple[int, ...]) -> Array:
     return out
 
 
-def each_chunk(count: int, body: Callable[[Array, object], object], carry: object, chunk: int = CHUNK) -> object:
+T = TypeVar("T")
+
+
+def each_chunk(count: int, body: Callable[[Array, T], T], carry: T, chunk: int = CHUNK) -> T:
     """Walk `count` grains in chunks: carry = body(first grain of the chunk, carry). count is a multiple of chunk."""
     if count == chunk:
         return body(jnp.int32(0), carry)

@@ -46,7 +46,9 @@ def make_task(config: TaskConfig | str, fidelity: Fidelity | str | None = None) 
     ):
         ratio = whole / part
         if abs(ratio - round(ratio)) > WHOLE * ratio or round(ratio) < 1:
-            raise ValueError(f"{what} = {whole:.6g} s is {ratio:.4g} times {part:.6g} s: make it a whole number of times.")
+            raise ValueError(
+                f"{what} = {whole:.6g} s is {ratio:.4g} times {part:.6g} s: make it a whole number of times."
+            )
     return TASKS[config.model](config, build(config.scene, fidelity))
 
 

@@ -108,7 +108,7 @@ class Push:
         return int(self.scene.bodies.model.body_rootid[self._ids[0]])
 
     def facts(self, state: State) -> dict[str, Array]:
-        """Masses in the goal, behind the blade and gone, in kg; the pile's mean x and its distance to the blade, in m."""
+        """Masses in the goal, behind the blade and gone, in kg; the pile's mean x and distance to the blade, in m."""
         grains, d = state.grains, state.rigid
         x = self.scene.world(grains.x)
         at = d.site_xpos[self._ids[1]].astype(x.dtype)

@@ -215,18 +215,22 @@ def test_only_bodies_with_joints_yield() -> None:
 
 def test_points_near_a_ball_fill_its_shell() -> None:
     b = coupled(model_of(TOOL), "ball")
-    count = points_near(b, ((-0.02, 0.03),), 0.01)[0]
-    assert count == pytest.approx(4 / 3 * np.pi * (0.13**3 - 0.08**3) / 0.01**3, rel=COUNT_TOLERANCE)
-    flat = points_near(b, ((-0.02, 0.03),), 0.01, middle=0.0)[0]
-    assert flat == pytest.approx(np.pi * (0.13**2 - 0.08**2) / 0.01**2, rel=COUNT_TOLERANCE)
-    assert points_near(b, ((-0.02, 0.03),), 0.01, middle=0.5)[0] <= 1
+    bands = (-0.02, 0.03), (-0.01, 0.01)
+    for (low, high), count in zip(bands, points_near(b, bands, 0.01), strict=True):
+        volume = 4 / 3 * np.pi * ((0.1 + high) ** 3 - (0.1 + low) ** 3)
+        assert count == pytest.approx(volume / 0.01**3, rel=COUNT_TOLERANCE)
+    for (low, high), count in zip(bands, points_near(b, bands, 0.01, middle=0.0), strict=True):
+        area = np.pi * ((0.1 + high) ** 2 - (0.1 + low) ** 2)
+        assert count == pytest.approx(area / 0.01**2, rel=COUNT_TOLERANCE)
+    assert points_near(b, bands, 0.01, middle=0.5) == (0, 0)
 
 
-def test_points_near_many_geoms_add_up_and_planes_count_as_none() -> None:
+def test_points_near_bodies_add_up_and_planes_count_as_none() -> None:
     model = model_of(TOOL)
-    each = [points_near(coupled(model, n), ((-0.02, 0.02),), 0.01)[0] for n in ("blade", "tip", "floor")]
+    band = ((-0.02, 0.02),)
+    each = [points_near(coupled(model, n), band, 0.01)[0] for n in ("blade", "tip", "floor")]
     assert each[2] == 0
-    assert points_near(coupled(model, "blade", "tip", "floor"), ((-0.02, 0.02),), 0.01)[0] == sum(each)
+    assert points_near(coupled(model, "blade", "tip", "floor"), band, 0.01) == (sum(each),)
 
 
 @pytest.mark.parametrize("integrator", ["implicit", "RK4"])

@@ -22,9 +22,7 @@ COPIES = 20  # instances of each class
 ITERATIONS = 6
 
 # Rounding of sums over 120 points whose masses span five decades, relative to the sum of the terms' sizes.
-BOOK_TOLERANCE = {"float32": 1e-5, "float64": 1e-13}
-# Energy after over energy before: rounding, plus what the gate of the safeguard lets through (1e-6 of the points').
-ENERGY_TOLERANCE = {"float32": 5e-6, "float64": 1e-12}
+BOOK_TOLERANCE = {"float32": 5e-7, "float64": 2e-15}
 SOLVED = 1e-10  # share of the equation left, as reported (float64)
 CHECKED = 1e-6  # the same by the second formulation, at the velocity returned: a light body amplifies it
 SOLVED_SHARE = 0.98  # of all instances, after 6 iterations; 0.99 observed
@@ -32,7 +30,9 @@ SOLVED_IN_CLASS = 0.85  # of 20 in the worst class, mass ratio 1e-3 with frictio
 DERIVATIVE_TOLERANCE = 1e-12  # float64
 HEAVY = 1e12  # a body so many times heavier is told where to go
 HEAVY_TOLERANCE = 1e-7
-EXPLICIT_GAIN = 5.0  # times the energy before; 8 observed in the mildest of 180 instances, 1e5 in the worst
+WEIGHTY = 1e4  # heavier still by this, in float32
+WEIGHTY_RESIDUAL = 1e-6  # 2e-7 observed; 2e-2 when the unknown was the velocity itself
+EXPLICIT_GAIN = 5.0  # times the energy before; 8 observed in the mildest of 180 instances, 4.7e3 in the worst
 
 each_precision = pytest.mark.parametrize("dtype", ["float32", "float64"])
 
@@ -259,7 +259,7 @@ def test_the_wrench_on_each_geom_is_the_reaction_of_its_points(dtype: str) -> No
 def test_energy_never_rises_whatever_the_masses_and_converged_or_not(dtype: str, iterations: int) -> None:
     i = in_precision(free_bodies(), dtype)
     before, after = energies(i, solve(i, (0,), dtype, iterations))
-    assert np.max(after / before) < 1 + ENERGY_TOLERANCE[dtype]
+    assert np.all(after < before)
     assert np.median(after / before) < 0.95, "nothing collided"
 
 
@@ -308,6 +308,27 @@ def test_a_body_without_joints_is_an_infinitely_heavy_one() -> None:
     np.testing.assert_allclose(b.impulse, a.impulse, rtol=0, atol=HEAVY_TOLERANCE * size)
     np.testing.assert_allclose(b.wrench, a.wrench, rtol=0, atol=POINTS * HEAVY_TOLERANCE * size)
     np.testing.assert_array_equal(a.residual, 0)
+
+
+def test_a_heavy_body_is_solved_in_float32_too() -> None:
+    """What it gives is far below the last digit of its velocity."""
+    i = free_bodies()
+    done = solve(i._replace(t=i.t._replace(M=i.t.M * WEIGHTY)), (0,), "float32")
+    assert done.residual.max() < WEIGHTY_RESIDUAL
+
+
+def test_bodies_that_stick_together_move_on_as_one() -> None:
+    """Plastic merge: all hits the front of a body and nothing turns it, v = (m1 v1 + m2 v2) / (m1 + m2)."""
+    i = free_bodies()
+    x = np.concatenate([i.p.x, 2 * i.t.centre - i.p.x], axis=1)  # point by point opposite about the centre
+    v, n = np.broadcast_to([-1.0, 0.3, 0], x.shape), np.broadcast_to([1.0, 0, 0], x.shape)
+    m, zero = np.tile(i.p.m, 2), np.zeros(x.shape[:2])
+    start = np.broadcast_to([0.5, 0, 0, 0, 0, 0], i.q_free.shape)
+    i = i._replace(p=Points(x, v, m, zero, n, zero.astype(np.int32)), q_free=start, mu=np.full_like(i.mu, 1e6))
+    done = solve(i, (0,), "float64")
+    M, total = i.t.M[:, 0, 0, None], m.sum(axis=1)[:, None]
+    np.testing.assert_allclose(done.q[:, :3], (M * start[:, :3] + total * v[:, 0]) / (M + total), atol=1e-12)
+    np.testing.assert_allclose(done.q[:, 3:], 0, atol=1e-9)
 
 
 def test_a_drift_is_as_good_as_a_velocity() -> None:

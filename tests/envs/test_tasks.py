@@ -165,7 +165,7 @@ def test_an_unknown_render_mode_is_refused() -> None:
 
 def test_a_control_step_that_is_no_whole_number_of_rigid_steps_is_refused() -> None:
     config = read_task("push_sand", ("control_dt=0.03",))
-    with pytest.raises(ValueError, match="control_dt = 0.03 s is 7.5 times 0.004 s"):
+    with pytest.raises(ValueError, match=r"control_dt = 0\.03 s is 7\.5 times 0\.004 s"):
         make_task(config, "draft")
 
 

@@ -28,10 +28,15 @@ FLOORS = {
     "mpm_env.sim": 2,
     "mpm_env.tasks": 3,
     "mpm_env.cli": 4,
+    "mpm_env.demo": 4,
     "mpm_env.env": 4,
+    "mpm_env.ledger": 4,
     "mpm_env.log": 4,
     "mpm_env.render": 4,
+    "mpm_env.replay": 4,
+    "mpm_env.run": 4,
     "mpm_env.train": 4,
+    "mpm_env.view": 4,
     "mpm_env": 5,
 }
 

@@ -8,6 +8,7 @@ import pytest
 
 from mpm_env.mpm.budgets import mass_that_left, total
 from mpm_env.mpm.materials import MATERIALS, Material
+from mpm_env.mpm.stability import SAFETY
 from mpm_env.mpm.types import MARGIN, Particles, Wall
 from tests.physics.blocks import GRAVITY, alive, balance, block, box, example, go, lattice, longest_step
 
@@ -17,7 +18,9 @@ SLOTS = 512
 SQUEEZE = -0.01  # b - I of grains that start compressed: they want to fly apart
 STEPS = 200
 ALIKE = 2e-5  # relative; float32 over 200 steps at offsets of a quarter cell: 4e-6 observed
-GAIN = 1e-3  # share of the first energy; less than its start observed in all cases
+# The energy that symplectic Euler keeps is not the true one: a lone grain's swings by this factor at the limit.
+SWING = 1 / (1 - SAFETY**2)
+MARGIN_OF_SWING = 1.1  # 1.0 observed: the lone grain reaches it
 
 each_material = pytest.mark.parametrize("name", MATERIALS)
 
@@ -42,12 +45,13 @@ def run(material: Material, p: Particles, *, gravity: float = 0.0) -> Particles:
 
 
 def assert_sound(material: Material, p: Particles, q: Particles) -> None:
-    """Everything finite, all grains there, and no energy from nowhere: speeds are bounded by it."""
+    """Everything finite, all grains there, no energy from nowhere, and nobody faster than it allows."""
     for field in q.__dataclass_fields__:
         assert np.isfinite(np.asarray(getattr(q, field))).all(), field
     np.testing.assert_array_equal(np.asarray(q.m), np.asarray(p.m))
     before, after = balance(GRID, material, p), balance(GRID, material, q)
-    assert after.kinetic + after.elastic <= (1 + GAIN) * (before.kinetic + before.elastic)
+    assert after.kinetic + after.elastic <= MARGIN_OF_SWING * SWING * (before.kinetic + before.elastic)
+    assert before.mass * np.max(np.square(q.v)) <= MARGIN_OF_SWING * SWING * 2 * before.elastic
 
 
 @each_material
@@ -56,12 +60,11 @@ def test_lone_grain_answers_alike_wherever_it_sits_in_its_cell(name: str) -> Non
     p = squeezed(material, every_offset(), DX**3 / 8)
     assert_sound(material, p, run(material, p))
     n, dt = STEPS, longest_step(GRID, material)
-    # Shorter than the way to the wall: 0.1 m.
-    g = 0.02 / (n * dt) ** 2
-    q = run(material, p, gravity=g)
+    lift = 0.02 / (n * dt) ** 2  # m/s^2 upwards: over a centimetre, and no window reaches a wall
+    q = run(material, p, gravity=-lift)
     here = alive(q)
-    np.testing.assert_allclose(np.asarray(q.v[2])[here], -g * n * dt, rtol=ALIKE)
-    np.testing.assert_allclose(np.asarray(q.v[:2])[:, here], 0, atol=ALIKE * g * n * dt)
+    np.testing.assert_allclose(np.asarray(q.v[2])[here], lift * n * dt, rtol=ALIKE)
+    np.testing.assert_allclose(np.asarray(q.v[:2])[:, here], 0, atol=ALIKE * lift * n * dt)
     e = np.asarray(q.e)[:, here]
     np.testing.assert_allclose(e - e[:, :1], 0, atol=ALIKE)
 
@@ -98,11 +101,7 @@ def test_tiny_grains_stay_sound(name: str, volume: float) -> None:
     heavy = jnp.arange(SLOTS) % 2 == 0
     V0 = jnp.where(heavy, DX**3 / 8, volume).astype(p.V0.dtype)
     p = replace(p, V0=V0, m=material.rho * V0)
-    q = run(material, p)
-    assert_sound(material, p, q)
-    # Energy does not bind a light grain beside a heavy one; the node they share does.
-    speed = np.linalg.norm(np.asarray(q.v), axis=0)
-    assert speed[1::2].max() <= 2 * speed[::2].max()
+    assert_sound(material, p, run(material, p))
 
 
 @each_material
@@ -166,12 +165,16 @@ def test_sand_that_left_pushes_no_more() -> None:
     np.testing.assert_array_equal(np.asarray(q.v), np.asarray(ideal.v))
 
 
-@pytest.mark.parametrize("v", [(0.0, -3.0), (0.0, 3.0)])
-def test_closed_walls_lose_nothing(v: tuple[float, float]) -> None:
-    material, p = sand_moving(v)
-    q = go(OPEN, material, p, dt=0.6 * longest_step(OPEN, material), steps=100)
-    np.testing.assert_array_equal(np.asarray(q.m), np.asarray(p.m))
-    half = OPEN.cell_size / 2  # a grain's window lets it reach half a cell behind the plane, where it stops
-    y = np.asarray(q.x[1])
-    low, high = MARGIN * OPEN.cell_size, (MARGIN + OPEN.cells[1]) * OPEN.cell_size
-    assert low - half <= y.min() and y.max() <= high + half
+# The same box with every kind of wall that is closed.
+CLOSED = replace(OPEN, walls=((Wall("slip"), Wall("separate", 0.5)), (Wall("stick"), Wall("slip"))))
+
+
+def test_closed_walls_lose_nothing() -> None:
+    for v in ((0.0, -3.0), (0.0, 3.0), (-3.0, 0.0), (3.0, 0.0)):
+        material, p = sand_moving(v)
+        q = go(CLOSED, material, p, dt=0.6 * longest_step(CLOSED, material), steps=400)
+        np.testing.assert_array_equal(np.asarray(q.m), np.asarray(p.m))
+        half = CLOSED.cell_size / 2  # a window lets a grain reach half a cell behind the plane, where it stops
+        for a in range(2):
+            x = np.asarray(q.x[a]) - MARGIN * CLOSED.cell_size
+            assert -half <= x.min() and x.max() <= CLOSED.cells[a] * CLOSED.cell_size + half

@@ -14,7 +14,12 @@ from jax import Array
 from mpm_env.mpm.linalg3 import TINY, compose, eigen
 from mpm_env.mpm.materials.protocol import LEAST_B, hencky_energy, lame, p_wave_speed
 
-LEAST_TAN = 1e-6  # keeps the tip of a frictionless cohesive cone at a finite (huge) tension
+LEAST_FRICTION = 1e-6  # rad: clay is the limit of no friction, a cone whose tip lies at a huge but finite tension
+# Slope of the cone over sin(friction), by the test that the angle comes from.
+FRICTION_FITS = {
+    "triaxial": lambda sin: math.sqrt(2 / 3) * 2 * sin / (3 - sin),  # K16 eq. 24
+    "plane_strain": lambda sin: math.sqrt(2) / 3 * sin,
+}
 VOLUME_CORRECTION_CAP = 0.1  # largest remembered dilation: beyond 10 % loose sand is spray, not a volume to restore
 
 
@@ -31,8 +36,8 @@ class Sand:
     by separation, which later compression must close before it meets stress.
 
     E Pa, nu, rho kg/m^3, friction rad (angle of internal friction), cohesion Pa. friction_fit says which test the angle
-    comes from, that is where the smooth cone touches Mohr-Coulomb: "triaxial" compression (K16), "plane_strain", or
-    "mc2d" (a purely two-dimensional cone: sin(phi) = stress ratio in the plane with the out-of-plane stress ignored).
+    comes from, that is where the smooth cone touches Mohr-Coulomb: "triaxial" compression (K16), or "plane_strain",
+    with which sin(phi) = (s1 - s3) / (s1 + s3) in the plane, what a two-dimensional Mohr-Coulomb model means by phi.
     """
 
     E: Array
@@ -46,13 +51,8 @@ class Sand:
 
     @property
     def alpha(self) -> Array:
-        """Slope of the cone: |s| <= -alpha tr(tau) for the Kirchhoff deviator s (K16 eq. 24 for the triaxial fit)."""
-        sin = jnp.sin(self.friction)
-        if self.friction_fit == "plane_strain":
-            return math.sqrt(2) / 3 * sin
-        if self.friction_fit == "mc2d":
-            return sin / math.sqrt(2)
-        return math.sqrt(2 / 3) * 2 * sin / (3 - sin)
+        """Slope of the cone: |s| <= -alpha (tr(tau) - 3 c cot(phi)) for the Kirchhoff deviator s."""
+        return FRICTION_FITS[self.friction_fit](jnp.sin(jnp.maximum(self.friction, LEAST_FRICTION)))
 
     def update(self, e: Array, history: Array) -> tuple[Array, Array, Array]:
         """Project the trial strain onto the cone: elastic inside, tip in tension, cone otherwise (K16 section 6.3)."""
@@ -62,7 +62,7 @@ class Sand:
         eps_trial = 0.5 * jnp.log1p(jnp.maximum(values, LEAST_B - 1))
         eps = eps_trial + history[0] / 3 if self.volume_correction else eps_trial
         # Cohesion shifts the tip of the cone to the tension c cot(phi), as a volumetric strain.
-        tip = self.cohesion / (bulk * jnp.maximum(jnp.tan(self.friction), LEAST_TAN))
+        tip = self.cohesion / (bulk * jnp.tan(jnp.maximum(self.friction, LEAST_FRICTION)))
         tr = jnp.sum(eps, axis=0)
         deviator = eps - tr / 3
         norm = jnp.sqrt(jnp.sum(deviator * deviator, axis=0) + TINY)

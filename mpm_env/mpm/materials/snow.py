@@ -28,8 +28,8 @@ class Snow:
     Rate independent, hardening in compression and softening in tension, not associated. Remembers ln J_P, the log of
     the plastic volume ratio; Lame parameters are scaled by h = exp(xi (1 - J_P)) (S13 eq. 2).
 
-    E Pa, nu, rho kg/m^3, theta_c and theta_s critical compression and stretch, xi hardening. Jp_min bounds the hardening
-    (S13 has no bound): h stays at its value for J_P = Jp_min however far the snow is packed, so that one time step is
+    E Pa, nu, rho kg/m^3, theta_c and theta_s critical compression and stretch, xi hardening. Jp_min bounds it (in
+    S13 nothing does): h stays at its value for J_P = Jp_min however far the snow is packed, so that one time step is
     right for the whole run.
     """
 
@@ -48,7 +48,7 @@ class Snow:
         return jnp.exp(self.xi * (1 - Jp))
 
     def update(self, e: Array, history: Array) -> tuple[Array, Array, Array]:
-        """Clamp the principal stretches, move the rest into ln J_P, and answer with the hardened stress (S13 section 5)."""
+        """Clamp the principal stretches, move the rest into ln J_P, answer with the hardened stress (S13 section 5)."""
         values, axes = eigen(e)
         values = jnp.maximum(values, LEAST_B - 1)
         # Stretch minus one, without losing the digits of small strains: sqrt(1 + B) - 1 = B / (1 + sqrt(1 + B)).
