@@ -103,8 +103,8 @@ def report(summary: dict[str, Any]) -> Iterator[str]:
     """A run's summary in a few lines."""
     numerics, wall, figures = summary["numerics"], summary["wall_s"], summary["figures"]
     yield f"{summary['scene']}: {figures['simulated_s']:.6g} s simulated, {summary['ended']}"
-    cell_mm, dt_us = 1000 * numerics["cell_size_m"], 1e6 * numerics["mpm_dt_s"]
-    yield f"{numerics['grains']} grains, cells of {cell_mm:.4g} mm, substeps of {dt_us:.3g} us"
+    cell_mm, dt_ms = 1000 * numerics["cell_size_m"], 1000 * numerics["mpm_dt_s"]
+    yield f"{numerics['grains']} grains, cells of {cell_mm:.4g} mm, substeps of {dt_ms:.3g} ms"
     yield (
         f"mass {figures['mass_end_kg']:.6g} kg of {figures['mass_start_kg']:.6g} kg,"
         f" {figures['mass_left_kg']:.4g} kg left the box; top at {figures['top_of_grains_m']:.4g} m"

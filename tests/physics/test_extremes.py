@@ -17,10 +17,11 @@ DX = GRID.cell_size
 SLOTS = 512
 SQUEEZE = -0.01  # b - I of grains that start compressed: they want to fly apart
 STEPS = 200
-ALIKE = 2e-5  # relative; float32 over 200 steps at offsets of a quarter cell: 4e-6 observed
+ALIKE = 5e-5  # relative; float32 over 200 steps at offsets of a quarter cell: 1e-5 observed
+SMALL = 5e-4  # of the largest speed; the rounding of masses from 1e-15 to 1e-1 kg: 6e-5 observed
 # The energy that symplectic Euler keeps is not the true one: a lone grain's swings by this factor at the limit.
 SWING = 1 / (1 - SAFETY**2)
-MARGIN_OF_SWING = 1.1  # 1.0 observed: the lone grain reaches it
+MARGIN_OF_SWING = 1.1  # 0.92 observed
 
 each_material = pytest.mark.parametrize("name", MATERIALS)
 
@@ -93,11 +94,13 @@ def test_all_grains_in_one_cell_stay_sound(name: str) -> None:
 @each_material
 @pytest.mark.parametrize("volume", [1e-18, 1e-9])
 def test_tiny_grains_stay_sound(name: str, volume: float) -> None:
-    """A cubic micrometre by itself, and beside grains a million and more times heavier."""
+    """A cubic micrometre moves as any other does, and stays sound beside grains up to 1e13 times heavier."""
     material = example(name)
-    rng = np.random.default_rng(1)
-    p = squeezed(material, (6 + 4 * rng.uniform(size=(3, SLOTS))) * DX, volume)
-    assert_sound(material, p, run(material, p))
+    sites = (6 + 4 * np.random.default_rng(1).uniform(size=(3, SLOTS))) * DX
+    p, usual = squeezed(material, sites, volume), squeezed(material, sites, DX**3 / 8)
+    q, expected = run(material, p), np.asarray(run(material, usual).v)
+    assert_sound(material, p, q)
+    np.testing.assert_allclose(np.asarray(q.v), expected, rtol=0, atol=SMALL * np.abs(expected).max())
     heavy = jnp.arange(SLOTS) % 2 == 0
     V0 = jnp.where(heavy, DX**3 / 8, volume).astype(p.V0.dtype)
     p = replace(p, V0=V0, m=material.rho * V0)

@@ -14,10 +14,12 @@ from tests.physics.blocks import example
 from tests.physics.oracles import rows, sand, tensors
 from tests.physics.test_materials import update
 
-VECTOR = {"float32": 1e-5, "float64": 1e-9}  # relative; 2e-6, 1e-10 (the digits given) observed
-DIGITS = 6e-11  # of the strains and volumes given
-RATIO = 1e-3  # of a stress ratio; 1e-9 (triaxial), 2e-4 (biaxial, still creeping to its end) observed
-CLOSED_FORM = {"float32": 1e-5, "float64": 1e-10}
+VECTOR = {"float32": 2e-6, "float64": 2e-10}  # relative; 3e-7, 3e-11 (the digits given) observed
+STRAIN = {"float32": 2e-7, "float64": 6e-11}  # 4e-8 and the digits given observed
+RATIO = 1e-6  # of a stress ratio; 3e-16 (triaxial, K0), 1e-7 (biaxial, which creeps to its end) observed
+HELD = 3e-5  # of the confining stress; 6e-6 observed where sand creeps
+CLOSED_FORM = {"float32": 1.5e-6, "float64": 2e-15}  # 3e-7, 2e-16 observed
+CLAY = 1e-5  # the cone of clay has the angle of LEAST_FRICTION: 2e-6 observed
 
 SHEAR = [[1, 0.05, 0], [0, 0.97, 0], [0, 0, 1]]
 
@@ -75,9 +77,9 @@ def test_return_mapping_gives_the_published_vectors(case: str, d: int, dtype: st
     scale = np.abs(v.tau).max() or 1e4  # Pa; of a trial that ends at the tip
     got = (tau[0, 0], tau[1, 1], tau[2, 2], tau[0, 1])
     np.testing.assert_allclose(got, v.tau, rtol=0, atol=VECTOR[dtype] * scale)
-    close = VECTOR[dtype] * 0.05 if dtype == "float32" else 5e-8 if case == "elastic" else DIGITS
+    close = 5e-8 if (dtype, case) == ("float64", "elastic") else STRAIN[dtype]  # given to seven digits
     np.testing.assert_allclose(H, v.H, rtol=0, atol=close)
-    np.testing.assert_allclose(vc, v.vc_new, rtol=0, atol=max(close, DIGITS))
+    np.testing.assert_allclose(vc, v.vc_new, rtol=0, atol=STRAIN[dtype])
 
 
 def test_unshifted_deviator_is_told_apart() -> None:
@@ -87,7 +89,7 @@ def test_unshifted_deviator_is_told_apart() -> None:
         wrong = sand(v.F[None], np.array([[v.vc]]), example("sand", "float64"), unshifted=True)
     H = 0.5 * np.log(np.linalg.eigvalsh(wrong.b[0]))
     np.testing.assert_allclose(H, (-0.0684059, -0.0013258, -0.0013258), atol=1e-7)
-    assert np.abs(H - np.array(v.H)).max() > 100 * VECTOR["float32"] * 0.05
+    assert np.abs(H - np.array(v.H)).max() > 1e4 * STRAIN["float32"]
 
 
 def test_remembered_dilation_is_bounded() -> None:
@@ -104,9 +106,9 @@ def test_frictionless_sand_bears_no_shear_and_clay_twice_its_cohesion(dtype: str
     with jax.enable_x64(dtype == "float64"):
         water, clay = (example("sand", dtype, friction=0.0, cohesion=x) for x in (0.0, c))
     s = np.linalg.eigvalsh(mapped(water, F, 0.0, 3, dtype)[2])
-    assert s.max() < -1e4 and np.ptp(s) < 1e-5 * abs(s.min())
+    assert s.max() < -1e4 and np.ptp(s) < CLAY * abs(s.min())
     tau = mapped(clay, np.diag([1.02, 0.95, 1.02]), 0.0, 3, dtype)[2]  # triaxial compression: s1 - s3 = 2 c
-    np.testing.assert_allclose(np.ptp(np.linalg.eigvalsh(tau)), 2 * c, rtol=1e-4)
+    np.testing.assert_allclose(np.ptp(np.linalg.eigvalsh(tau)), 2 * c, rtol=CLAY)
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
@@ -121,7 +123,7 @@ def test_cohesive_sand_has_its_closed_form_strengths(phi: float, dtype: str) -> 
     tau = mapped(material, np.diag([1.04, 0.9, 1.04]), 0.0, 3, dtype)[2]
     N = (1 + np.sin(f)) / (1 - np.sin(f))
     major, minor = -tau[1, 1], -tau[0, 0]
-    np.testing.assert_allclose(major, N * minor + 2 * c * np.sqrt(N), rtol=10 * CLOSED_FORM[dtype])
+    np.testing.assert_allclose(major, N * minor + 2 * c * np.sqrt(N), rtol=CLOSED_FORM[dtype])
 
 
 # Element tests: one grain for each friction angle, float64, driven through `update` by principal log strains.
@@ -138,9 +140,7 @@ def driven(material: Material, step: Array, steps: Array, held: Array) -> Array:
     soft = jnp.sum(held) * K + material.E  # stiffer than any of them: the sides reach their stress from one side
 
     def answer(eps: Array) -> tuple[Array, Array]:
-        e, _, tau = material.update(
-            jnp.concatenate([jnp.expm1(2 * eps), jnp.zeros_like(eps)]), jnp.zeros_like(eps[:1])
-        )
+        e, _, tau = material.update(jnp.concatenate([jnp.expm1(2 * eps), jnp.zeros_like(eps)]), jnp.zeros_like(eps[:1]))
         return 0.5 * jnp.log1p(e[:3]), tau[:3]
 
     def give_way(_: Array, trial: Array) -> Array:
@@ -162,7 +162,7 @@ def failed(fit: str, *, axial: float, steps: int, plane: bool) -> np.ndarray:
         material = replace(material, friction=jnp.asarray(np.deg2rad(ANGLES)))
         held = jnp.asarray([[0.0], [1.0], [0.0 if plane else 1.0]])
         s = -np.asarray(driven(material, jnp.asarray(axial / steps), jnp.int32(steps), held))
-    np.testing.assert_allclose(s[1], CONFINING, rtol=RATIO / 10)
+    np.testing.assert_allclose(s[1], CONFINING, rtol=HELD)
     return s
 
 
@@ -174,17 +174,17 @@ def test_triaxial_compression_fails_at_the_friction_angle() -> None:
     np.testing.assert_allclose(s[0] / s[1], (2.039607, 2.463913, 3.0, 3.690172), rtol=RATIO)
     np.testing.assert_allclose(s[2], s[1], rtol=RATIO)
     other = failed("plane_strain", axial=-0.1, steps=40, plane=False)  # the negative control
-    assert np.abs(other[0] / s[0] - 1).min() > 50 * RATIO
+    assert np.abs(other[0] / s[0] - 1).min() > 0.05
 
 
 def test_plane_strain_compression_fails_at_the_friction_angle_of_its_fit() -> None:
     """sin = (s1 - s3) / (s1 + s3) under the plane strain fit; the triaxial fit is stronger there, 44 degrees for 30."""
     s = failed("plane_strain", axial=-0.2, steps=200, plane=True)
     np.testing.assert_allclose((s[0] - s[1]) / (s[0] + s[1]), np.sin(np.deg2rad(ANGLES)), rtol=RATIO)
-    np.testing.assert_allclose(s[2], (s[0] + s[1]) / 2, rtol=0.01)
+    np.testing.assert_allclose(s[2], (s[0] + s[1]) / 2, rtol=2 * RATIO)
     t = failed("triaxial", axial=-0.4, steps=400, plane=True)
     strong = np.rad2deg(np.arcsin((t[0] - t[1]) / (t[0] + t[1])))
-    np.testing.assert_allclose(strong[:3], (26.47, 34.61, 43.85), atol=0.1)
+    np.testing.assert_allclose(strong[:3], (26.47, 34.61, 43.85), rtol=0, atol=0.01)
 
 
 def test_oedometer_rests_at_the_larger_of_the_elastic_and_the_active_pressure() -> None:

@@ -13,7 +13,9 @@ from tests.physics.blocks import alive, block, box, example, go, lattice
 
 LONE = (0.99, 1.01)  # of the closed form: a lone grain is stable at the first and not at the second
 GROWTH = 10.0  # of the first speeds; what is stable decays, what is not grows without bound
-RAGGED_BREAKS = 1.3  # of the lone grain's limit: blocks at one grain per cell broke at 1.03 to 1.2 (24 blocks, nu 0 to .45)
+RAGGED_BREAKS = (
+    1.3  # of the lone grain's limit: blocks at one grain per cell broke at 1.03 to 1.2 (24 blocks, nu 0 to .45)
+)
 STEPS = 1000
 STRAIN = 0.15  # b - I: a stretch of 7 %
 RESONANCE = np.sin(np.pi / 3)
