@@ -24,8 +24,8 @@ setup: $(READY)  ## make .venv with the pinned packages (the other targets do it
 demo: $(READY)  ## dig sand, write the log and pictures to demo_out/ (ARGS=... adds options)
 	$(BIN)/mpm-env demo dig --out demo_out $(ARGS)
 
-test: $(READY)  ## all tests (ARGS="-n 2" uses two processes)
-	$(BIN)/python -m pytest $(ARGS)
+test: $(READY)  ## all tests, a process per core
+	$(BIN)/python -m pytest -n auto --dist loadfile $(ARGS)
 
 test-fast: $(READY)  ## the tests under 5 s each
 	$(BIN)/python -m pytest -m "not slow" $(ARGS)

@@ -8,6 +8,9 @@ import hypothesis
 # Tests compare with float64 oracles and to the bit across runs: the CPU, unless someone asks for a GPU.
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
+# One thread per process, as mpm_env itself asks for when it is imported before JAX.
+os.environ.setdefault("NPROC", "1")
+
 # A coupled step takes many seconds to compile: keep every program for the next run and the other processes.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).resolve().parent.parent / ".cache" / "jax"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")

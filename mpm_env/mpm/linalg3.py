@@ -27,7 +27,8 @@ def eigen(e: Array) -> tuple[Array, Array]:
     """Principal values (3, n), unsorted, and principal axes of symmetric tensors e (s, n).
 
     The axes are (2, 2, n) in plane strain, where the third value belongs to the out-of-plane direction, and (3, 3, n)
-    in 3-D; axes[i, k] is component i of axis k.
+    in 3-D; axes[i, k] is component i of axis k. Derivatives of what is composed from them are right wherever the values
+    differ; where two are equal to the last bit, a shear of their plane counts as none.
     """
     if e.shape[0] == 4:
         c, s, t = _rotation(e[0], e[1], e[3])
@@ -35,7 +36,7 @@ def eigen(e: Array) -> tuple[Array, Array]:
         return values, jnp.stack([jnp.stack([c, s]), jnp.stack([-s, c])])
     one, zero = jnp.ones_like(e[0]), jnp.zeros_like(e[0])
     start = ([e[i] for i in range(6)], [[one if i == k else zero for k in range(3)] for i in range(3)])
-    # A loop, not twelve rotations in a row: XLA then runs it faster, and its reverse-mode derivative forty times faster.
+    # A loop, not twelve rotations in a row: XLA runs it faster, and its reverse-mode derivative forty times faster.
     a, V = lax.fori_loop(0, SWEEPS, lambda _, state: _sweep(*state), start)
     return jnp.stack(a[:3]), jnp.stack([jnp.stack(row) for row in V])
 

@@ -18,9 +18,9 @@ from mpm_env.mpm.types import MARGIN, Grid, Particles, Wall
 GRAVITY = 9.81  # m/s^2
 
 PARAMETERS: dict[str, dict[str, float]] = {
-    "elastic": dict(E=1e6, nu=0.3, rho=1550.0),
-    "sand": dict(E=3.537e5, nu=0.3, rho=2200.0, friction=np.deg2rad(30), cohesion=0.0),
-    "snow": dict(E=1.4e5, nu=0.2, rho=400.0, theta_c=0.025, theta_s=0.0075, xi=10.0, Jp_min=0.5),
+    "elastic": {"E": 1e6, "nu": 0.3, "rho": 1550.0},
+    "sand": {"E": 3.537e5, "nu": 0.3, "rho": 2200.0, "friction": np.deg2rad(30), "cohesion": 0.0},
+    "snow": {"E": 1.4e5, "nu": 0.2, "rho": 400.0, "theta_c": 0.025, "theta_s": 0.0075, "xi": 10.0, "Jp_min": 0.5},
 }
 
 
@@ -68,11 +68,17 @@ def block(
 
 
 def spinning(sites: np.ndarray, omega: float) -> tuple[np.ndarray, np.ndarray]:
-    """Velocities (d, n) and affine velocity (d, d) of a rigid turn about the sites' centre, in the plane of axes 0, 1."""
+    """Velocities (d, n) and affine velocity (d, d) of a rigid turn about the sites' centre, axis 0 to 1."""
     d = len(sites)
     W = np.zeros((d, d))
     W[0, 1], W[1, 0] = -omega, omega
     return W @ (sites - sites.mean(axis=1, keepdims=True)), W
+
+
+@jax.jit
+def update(material: Material, e: Array, history: Array) -> tuple[Array, Array, Array]:
+    """The material's answer e, history, tau to trial strains."""
+    return material.update(e, history)
 
 
 @partial(jax.jit, static_argnums=0)

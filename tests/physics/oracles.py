@@ -1,4 +1,4 @@
-"""The constitutive models once more, from a float64 singular value decomposition of F: what the library is held against.
+"""The constitutive models once more, from a float64 SVD of F: what the library is held against.
 
 Written from the papers for F (n, 3, 3), with plain numbers: no b, no component rows, no guards.
 """

@@ -43,7 +43,7 @@ def before_and_after(d: int, *, affine: float, dtype: str = "float32") -> tuple[
 
 def errors(d: int, before: Budgets, after: Budgets) -> tuple[float, float, float]:
     """Relative change of mass, momentum (over M omega R) and angular momentum."""
-    grid, sites = BLOCKS[d]
+    _, sites = BLOCKS[d]
     scale = before.mass * OMEGA * np.ptp(sites[0]) / 2
     p, L = after.momentum - before.momentum, after.angular_momentum - before.angular_momentum
     return (

@@ -10,7 +10,7 @@ from mpm_env.mpm.budgets import mass_that_left, total
 from mpm_env.mpm.materials import MATERIALS, Material
 from mpm_env.mpm.stability import SAFETY
 from mpm_env.mpm.types import MARGIN, Particles, Wall
-from tests.physics.blocks import GRAVITY, alive, balance, block, box, example, go, lattice, longest_step
+from tests.physics.blocks import GRAVITY, alive, balance, block, box, example, go, lattice, longest_step, update
 
 GRID = box((16, 16, 16), 1 / 16)
 DX = GRID.cell_size
@@ -30,7 +30,7 @@ def squeezed(material: Material, sites: np.ndarray, volume: float) -> Particles:
     """Grains at sites (3, n) m, all compressed alike."""
     p = block(GRID, material, sites, volume=volume, slots=SLOTS)
     e = jnp.zeros_like(p.e).at[:3].set(SQUEEZE)
-    e, history, tau = material.update(e, p.history)
+    e, history, tau = update(material, e, p.history)
     return replace(p, e=e, tau=tau, history=history)
 
 
@@ -159,7 +159,7 @@ def test_sand_that_left_pushes_no_more() -> None:
     sites = lattice((0.5, 0.1), (8, 8), spacing)
     p = block(OPEN, material, sites, volume=spacing**2)
     e = jnp.zeros_like(p.e).at[:2].set(SQUEEZE)
-    e, history, tau = material.update(e, p.history)
+    e, _, tau = update(material, e, p.history)
     p = replace(p, e=e, tau=tau, m=jnp.where(p.x[0] > PLANES[1], 0, p.m))
     assert 0 < np.count_nonzero(alive(p)) < p.count
     erased = replace(p, **{f: jnp.where(p.m > 0, getattr(p, f), 0) for f in ("e", "tau")})

@@ -1,4 +1,4 @@
-"""What every constitutive model keeps, whichever it is: run over the table, in plane strain and 3-D, in both precisions."""
+"""What every constitutive model keeps: run over the table, in plane strain and 3-D, in both precisions."""
 
 import jax
 import jax.numpy as jnp
@@ -7,7 +7,7 @@ import pytest
 from jax import Array
 
 from mpm_env.mpm.materials import MATERIALS, Material
-from tests.physics.blocks import PARAMETERS, example
+from tests.physics.blocks import PARAMETERS, example, update
 from tests.physics.oracles import ORACLES, rotations, rows, tensors, turned
 
 N = 256  # grains side by side: one shape, one program per material, dimension and precision
@@ -23,11 +23,6 @@ SLOPE = 1e-13  # of the stress; exact differentiation in float64, 2e-14 observed
 each_material = pytest.mark.parametrize("name", MATERIALS)
 each_dimension = pytest.mark.parametrize("d", [2, 3])
 each_precision = pytest.mark.parametrize("dtype", ["float32", "float64"])
-
-
-@jax.jit
-def update(material: Material, e: Array, history: Array) -> tuple[Array, Array, Array]:
-    return material.update(e, history)
 
 
 @jax.jit
@@ -138,7 +133,7 @@ def test_turned_strain_gives_turned_answer(name: str, d: int, dtype: str) -> Non
 
 
 def awkward(d: int) -> np.ndarray:
-    """Trial strains (s, N): the identity, repeated and nearly repeated values, stretches 1e-3 to 1e3, lost definiteness."""
+    """Trial strains (s, N): the identity, (nearly) repeated values, stretches 1e-3 to 1e3, lost definiteness."""
     rng = np.random.default_rng(2)
     s = np.ones((N, 3))
     s[8:16] = rng.uniform(0.5, 2, (8, 1))

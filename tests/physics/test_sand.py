@@ -10,9 +10,8 @@ import pytest
 from jax import Array, lax
 
 from mpm_env.mpm.materials import Material, Sand
-from tests.physics.blocks import example
+from tests.physics.blocks import example, update
 from tests.physics.oracles import rows, sand, tensors
-from tests.physics.test_materials import update
 
 VECTOR = {"float32": 2e-6, "float64": 2e-10}  # relative; 3e-7, 3e-11 (the digits given) observed
 STRAIN = {"float32": 2e-7, "float64": 6e-11}  # 4e-8 and the digits given observed

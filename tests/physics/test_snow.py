@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from mpm_env.mpm.materials import Material
-from tests.physics.blocks import PARAMETERS, example
+from tests.physics.blocks import PARAMETERS, example, update
 from tests.physics.oracles import lame
-from tests.physics.test_materials import update
 
 VECTOR = {"float32": 2e-6, "float64": 3e-10}  # relative; 4e-7, 6e-11 (the digits given) observed
 CURVE = {"float32": 4e-6, "float64": 4e-13}  # relative to the closed form after 400 steps; 7e-7, 7e-14 observed
