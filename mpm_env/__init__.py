@@ -2,7 +2,7 @@
 
     read_scene, load_fidelity    what is simulated, and how finely, from files
     build, initial               a checked Scene, and its first State
-    step, advance, scripted      the coupled simulation as pure functions
+    rigid_step, advance, scripted      the coupled simulation as pure functions
     run.run, demo.demo           a scene, or a task's script, to a folder of results
     make_task                    a task; tasks.reset(task, key) and tasks.step(task, episode, action) are pure
 
@@ -33,9 +33,8 @@ _HOMES = {
     "initial": "scene",
     "Drive": "sim",
     "advance": "sim",
-    "repeat": "sim",
     "scripted": "sim",
-    "step": "sim",
+    "rigid_step": "sim",
     "Health": "health",
     "make_task": "tasks",
     "read_task": "tasks",

@@ -16,7 +16,7 @@ FOR_FIDELITY = "fidelity."  # begins the settings that are not the scene's
 KINDS = ("scenes", "tasks", "materials", "fidelities")
 START = """\
 first steps:
-  mpm-env demo dig --out demo_out
+  mpm-env demo dig
   mpm-env run column_collapse_2d --fidelity draft --out out
   mpm-env run blade_push --set bodies.friction=0.2 --set fidelity.cells=5 --out out
   mpm-env replay out/run.rrd --view
@@ -105,10 +105,18 @@ def report(summary: dict[str, Any]) -> Iterator[str]:
     yield f"{summary['scene']}: {figures['simulated_s']:.6g} s simulated, {summary['ended']}"
     cell_mm, dt_ms = 1000 * numerics["cell_size_m"], 1000 * numerics["mpm_dt_s"]
     yield f"{numerics['grains']} grains, cells of {cell_mm:.4g} mm, substeps of {dt_ms:.3g} ms"
-    yield (
-        f"mass {figures['mass_end_kg']:.6g} kg of {figures['mass_start_kg']:.6g} kg,"
-        f" {figures['mass_left_kg']:.4g} kg left the box; top at {figures['top_of_grains_m']:.4g} m"
-    )
+    if figures["mass_start_kg"]:
+        top = "" if figures["top_of_grains_m"] is None else f"; top at {figures['top_of_grains_m']:.4g} m"
+        yield (
+            f"mass {figures['mass_end_kg']:.6g} kg of {figures['mass_start_kg']:.6g} kg,"
+            f" {figures['mass_left_kg']:.4g} kg left the box{top}"
+        )
+    for snow in figures["snow"]:
+        if snow["J_P_least"] < snow["Jp_min"]:
+            yield (
+                f"snow was packed to J_P = {snow['J_P_least']:.3g}, below its Jp_min = {snow['Jp_min']:.3g}: its"
+                " hardening stayed at its cap there"
+            )
     for name, force in figures["forces_of_grains"].items():
         yield f"grains on {name}: at most {force['peak_N']:.4g} N, at {force['peak_at_s']:.4g} s"
     yield (
@@ -120,9 +128,11 @@ def report(summary: dict[str, Any]) -> Iterator[str]:
 
 
 def _add_replay(commands: Any) -> None:
-    replay = commands.add_parser("replay", help="simulate a recording again and compare", allow_abbrev=False)
+    replay = commands.add_parser(
+        "replay", help="simulate a recording again and compare, or view it", allow_abbrev=False
+    )
     replay.add_argument("file", metavar="FILE.rrd", help="a recording of mpm-env")
-    replay.add_argument("--view", action="store_true", help="open it in the Rerun viewer as well")
+    replay.add_argument("--view", action="store_true", help="only open it in the Rerun viewer: nothing is simulated")
     replay.set_defaults(command=_replay)
 
 
@@ -130,10 +140,12 @@ def _replay(options: argparse.Namespace) -> int:
     with refusing():
         from mpm_env.log import open_viewer, read
 
-        recording = read(options.file)
-        use_precision(recording.recipe.get("fidelity", {}).get("precision", "f32"))
         if options.view:
             open_viewer(options.file)
+            return 0
+        recording = read(options.file)
+        fidelity = recording.recipe.get("fidelity")
+        use_precision(fidelity.get("precision", "f32") if isinstance(fidelity, dict) else "f32")
         from mpm_env.replay import compare
 
         found = compare(recording, progress=sys.stderr.isatty())
@@ -142,13 +154,16 @@ def _replay(options: argparse.Namespace) -> int:
     if not recording.complete:
         print("the recording was cut short: its whole frames are compared")
     if found.identical:
-        print(f"identical: the largest difference over {found.frames} frames is 0 m")
+        print(f"identical: grains and bodies are the same to the bit over {found.frames} frames")
         return 0
-    where = "" if found.at is None else " of the grain at ({:.4g}, {:.4g}, {:.4g}) m".format(*found.at)
-    print(
-        f"different: the largest difference over {found.frames} frames is {found.largest:.3g} m,{where} at"
-        f" {found.time:.6g} s (step {found.step})"
-    )
+    print(f"different over {found.frames} frames")
+    for what, unit, most in (
+        ("grains", "m", found.grains),
+        ("bodies", "(m, or entries of a rotation matrix)", found.bodies),
+    ):
+        place = f", that of {most.where}," if most.where else ""
+        at = f"{place} at {most.time:.6g} s (step {most.step})" if most.size else ""
+        print(f"{what}: the largest difference is {most.size:.3g} {unit}{at}")
     return DIFFERS
 
 
@@ -174,7 +189,10 @@ def _add_demo(commands: Any) -> None:
     demo.add_argument("--fidelity", metavar="F", help="a name, or a .yaml file (default: the one that the task names)")
     demo.add_argument("--seed", type=int, default=0, metavar="N", help="shapes the bed (default 0)")
     demo.add_argument(
-        "--out", required=True, metavar="DIR", help="folder for demo.rrd, demo.webp, demo.png, summary.json"
+        "--out",
+        default="demo_out",
+        metavar="DIR",
+        help="folder for demo.rrd, demo.webp, demo.png, summary.json (default demo_out)",
     )
     demo.set_defaults(command=_demo)
 
@@ -182,17 +200,20 @@ def _add_demo(commands: Any) -> None:
 def _demo(options: argparse.Namespace) -> int:
     with refusing():
         from mpm_env.demo import FILES, prepare
+        from mpm_env.fidelity import load_fidelity
         from mpm_env.tasks import read_task
 
-        show = prepare(
-            read_task(DEMOS.get(options.task, options.task)), options.fidelity, options.out, seed=options.seed
-        )
+        task = read_task(DEMOS.get(options.task, options.task))
+        fidelity = load_fidelity(options.fidelity or task.scene.fidelity)
+        use_precision(fidelity.precision)
+        show = prepare(task, fidelity, options.out, seed=options.seed)
     summary = show.go(progress=sys.stderr.isatty())
     facts, wall = summary["facts"], summary["wall_s"]
     outcome = "reached" if summary["success"] else "NOT reached"
     print(f"{summary['task']}: goal of {summary['target_kg']:g} kg {outcome}, {summary['time_s']:g} s simulated")
     print(", ".join(f"{k.removesuffix('_kg')} {v:.3g} kg" for k, v in facts.items() if k.endswith("_kg")))
-    print(f"force on the tool: mean {summary['force_mean_N']:.3g} N, peak {summary['force_peak_N']:.3g} N")
+    largest = summary["force_largest_mean_of_an_action_N"]
+    print(f"force on the tool: mean {summary['force_mean_N']:.3g} N, largest mean of an action {largest:.3g} N")
     print(f"{summary['grains']} grains; wall time {', '.join(f'{k} {v:.1f} s' for k, v in wall.items())}")
     for sentence in summary["health"]["sentences"]:
         print(f"warning: {sentence}")

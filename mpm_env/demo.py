@@ -22,7 +22,8 @@ from mpm_env.tasks import TaskConfig
 from mpm_env.tasks.episode import actions_per_episode, scripted_action
 from mpm_env.view import View, camera_of, write_frame
 
-FILES = ("demo.rrd", "demo.webp", "demo.png", "summary.json")
+RECORDING = "demo.rrd"
+FILES = (RECORDING, "demo.webp", "demo.png", "summary.json")
 SKIP = 2  # actions per frame of the moving picture
 SETTLE = 5  # actions after the script's end, for what still falls
 
@@ -37,8 +38,9 @@ def demo(
 ) -> dict[str, Any]:
     """Follow a task's script for one episode; leave demo.rrd, demo.webp, demo.png and summary.json in `out`.
 
-    Returns the summary. The episode runs to the end of its script, past success, so that what is delivered can come to
-    rest. Raises ValueError, in one sentence, for what cannot be simulated; nothing is written then.
+    Returns the summary; each of its forces is a mean over an action, so a blow shorter than that counts for less. The
+    episode runs to the end of its script, past success, so that what is delivered can come to rest. Raises ValueError,
+    in one sentence, for what cannot be simulated; nothing is written then.
     """
     return prepare(task, fidelity, out, seed=seed).go(progress=progress)
 
@@ -51,31 +53,36 @@ def prepare(
     env = GrainsEnv(task, fidelity)
     if seed < 0:
         raise ValueError(f"seed = {seed} is negative: use 0 or more.")
-    path = folder(out, FILES)
-    return Demo(env, path, seed, perf_counter() - began)
+    built = perf_counter()
+    env.reset(seed=seed)
+    started = perf_counter()
+    with folder(out, FILES) as path:
+        recorder = _recorder(env, path / RECORDING, seed)
+    for name in FILES:
+        if name != RECORDING:
+            (path / name).unlink(missing_ok=True)
+    return Demo(env, path, seed, recorder, {"build": built - began, "compile": started - built})
 
 
 @dataclass(eq=False)
 class Demo:
     """A scripted episode, built and about to start."""
 
-    env: GrainsEnv
+    env: GrainsEnv  # just reset
     out: Path
     seed: int
-    build_s: float
+    recorder: Recorder
+    spent: dict[str, float]  # s, on what
 
     def go(self, *, progress: bool = True) -> dict[str, Any]:
         """Run it, write the files, return the summary."""
         env, scene = self.env, self.env.task.scene
         dt = env.task.config.control_dt
-        wall = {"build": self.build_s, "compile": 0.0, "run": 0.0, "log": 0.0}
-        started = perf_counter()
-        env.reset(seed=self.seed)
-        wall["compile"] += perf_counter() - started
+        wall = {**self.spent, "run": 0.0, "log": 0.0}
         count = min(round(env.task.script()[-1][0] / dt) + SETTLE, actions_per_episode(env.task))
         views: list[View] = []
         rewards, forces, interest = [], [], []
-        with self._recorder() as recorder:
+        with self.recorder as recorder:
             _frame(recorder, env)
             for k in tqdm(range(count), unit="action", disable=not progress):
                 assert env.episode is not None
@@ -104,7 +111,7 @@ class Demo:
             "facts": {k: float(v) for k, v in e.facts.items()},
             "return": float(np.sum(rewards)),
             "force_mean_N": float(np.mean(forces)),
-            "force_peak_N": float(np.max(forces)),
+            "force_largest_mean_of_an_action_N": float(np.max(forces)),
             "time_s": count * dt,
             "grains": int(np.count_nonzero(np.asarray(e.state.grains.m))),
             "health": {"names": names(int(e.state.health)), "sentences": sentences(int(e.state.health))},
@@ -116,31 +123,28 @@ class Demo:
         (self.out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
         return summary
 
-    def _recorder(self) -> Recorder:
-        """The recording, open, with all that a re-simulation needs."""
-        scene = self.env.task.scene
-        assert scene.bodies is not None
-        box, camera = scene.config.box, camera_of(scene)
-        recipe = {
-            "kind": "task",
-            "scene": scene.config.name,
-            "seed": self.seed,
-            "key": self.env.key_number,
-            "config": self.env.task.config.model_dump(mode="json"),
-            "fidelity": scene.fidelity.model_dump(mode="json"),
-            "versions": versions(),
-        }
-        return Recorder(
-            self.out / "demo.rrd",
-            recipe=recipe,
-            model=scene.bodies.model,
-            box=(box.lower, box.upper),
-            view=(camera.eye, camera.target),
-        )
+
+def _recorder(env: GrainsEnv, path: Path, seed: int) -> Recorder:
+    """The recording of an environment that was just reset, open, with all that a re-simulation needs."""
+    scene = env.task.scene
+    assert scene.bodies is not None
+    box, camera = scene.config.box, camera_of(scene)
+    recipe = {
+        "kind": "task",
+        "scene": scene.config.name,
+        "seed": seed,
+        "key": env.key_number,
+        "config": env.task.config.model_dump(mode="json"),
+        "fidelity": scene.fidelity.model_dump(mode="json"),
+        "versions": versions(),
+    }
+    return Recorder(
+        path, recipe=recipe, model=scene.bodies.model, box=(box.lower, box.upper), view=(camera.eye, camera.target)
+    )
 
 
 def _frame(recorder: Recorder, env: GrainsEnv) -> None:
-    """One frame of the recording: the state, the tool's wrench, reward terms, masses and places."""
+    """One frame of the recording: the state, wrenches as means over the last action, reward terms, masses, places."""
     e, scene = env.episode, env.task.scene
     assert e is not None
     scalars = {f"reward/{k}": float(v) for k, v in e.terms.items()} | {"reward/total": float(e.reward)}
@@ -151,7 +155,7 @@ def _frame(recorder: Recorder, env: GrainsEnv) -> None:
         recorder,
         View.of(scene, e.state),
         step=int(e.state.steps),
-        reactions=np.asarray(e.state.reaction)[None],
+        reactions=np.asarray(e.reactions)[None],
         quantity="speed",
         scalars=scalars,
     )

@@ -28,7 +28,7 @@ SENTENCES: dict[Health, str] = {
     Health.LEFT_GRID: "A grain went through a closed wall and left the grid: the time step is too long for its speed.",
     Health.TOO_FAST: "A grain crossed over half a cell in one substep: use a smaller courant or a lower speed.",
     Health.INVERTED: "A grain's velocity gradient would turn it inside out in one substep: use a smaller courant.",
-    Health.TOO_DEEP: "A grain stands more than half a cell inside a body: the tool is too thin or too fast for them.",
+    Health.TOO_DEEP: "A grain stands half a cell, or a quarter of the thickness, inside a body: too thin or too fast.",
     Health.NODES_OVERFLOW: "More grid nodes are near bodies than were set aside: contact is incomplete.",
     Health.GRAINS_OVERFLOW: "More grains are near bodies than were set aside: contact is incomplete.",
     Health.NOT_CONVERGED: "Contact between grains and bodies was not solved: raise contact_iterations.",

@@ -11,8 +11,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mpm_env.mpm.budgets import budgets
+from mpm_env.mpm.budgets import budgets, total
 from mpm_env.scene import Scene, State
+from mpm_env.scene_config import SnowConfig
 from mpm_env.view import View
 
 LAST_SHARE = 0.1  # of a run: mean forces "at the end" are over this
@@ -22,7 +23,8 @@ LAST_SHARE = 0.1  # of a run: mean forces "at the end" are over this
 class Ledger:
     """Time series of a run; `arrays` names them, with shapes and units.
 
-    frames f, rigid steps k, bodies b (the world is body 0), coupled geoms g, snapshots s, slots n.
+    frames f, rigid steps k, bodies b (the world is body 0), coupled geoms g, snapshots s, slots n, rows of history h,
+    kinds of snow q.
     """
 
     scene: Scene
@@ -33,6 +35,8 @@ class Ledger:
     def __post_init__(self) -> None:
         scene = self.scene
         gravity = jnp.asarray(scene.gravity, scene.dtype)
+        self._start: np.ndarray | None = None  # (n,) kg, each slot's mass at the first frame
+        self._snow = [k for k, grains in enumerate(scene.config.grains) if grains.material.model == "snow"]
         self._budgets = jax.jit(lambda state: budgets(scene.grid, scene.beds(state.materials), state.grains, gravity))
 
     def note(self, state: State, view: View, reactions: np.ndarray) -> dict[str, float]:
@@ -41,8 +45,9 @@ class Ledger:
             "step": int(state.steps),
             "time": view.time,
             "health": int(state.health),
-            "mass_left": float(state.left),
+            **self._of_mass(state),
             **self._of_grains(state),
+            **self._of_snow(state),
             **self._of_bodies(state, view),
         }
         for key, value in row.items():
@@ -66,6 +71,7 @@ class Ledger:
         x[view.slots] = view.grains
         v[view.slots] = _in_space(np.asarray(state.grains.v), scene)[view.slots]
         row = {"time": view.time, "x": x, "v": v, "mass": np.asarray(state.grains.m)}
+        row["history"] = np.asarray(state.grains.history)
         for key, value in row.items():
             self.snapshots.setdefault(f"snapshot_{key}", []).append(value)
 
@@ -74,10 +80,12 @@ class Ledger:
 
         step, time s, health (f,); body_position (f, b, 3) m, body_quaternion (f, b, 4) w x y z, body_twist (f, b, 6)
         m/s and rad/s at the body's origin; qpos, qvel, control (f, nq | nv | nu); reaction_time (k,) s and reaction
-        (k, g, 6) N and N m about the body's centre of mass, mean over each rigid step; of the grains mass, mass_left
-        (f,) kg, momentum (f, 3) kg m/s, angular_momentum (f, 3) kg m^2/s about the world's origin, kinetic, elastic,
-        potential (f,) J; the same of the bodies as bodies_*, potential zero at z = 0; snapshot_time (s,) s, snapshot_x
-        (s, n, 3) m, snapshot_v (s, n, 3) m/s, snapshot_mass (s, n) kg, snapshot_material (n,).
+        (k, g, 6) N and N m about the body's centre of mass, mean over each rigid step; of the grains mass, and mass_left
+        of those that were there at the first frame and are gone (f,) kg, momentum (f, 3) kg m/s, angular_momentum (f, 3)
+        kg m^2/s about the world's origin, kinetic, elastic, potential (f,) J; the same of the bodies as bodies_*,
+        potential zero at z = 0; snapshot_time (s,) s, snapshot_x (s, n, 3) m, snapshot_v (s, n, 3) m/s, snapshot_mass
+        (s, n) kg, snapshot_material (n,), snapshot_history (s, h, n) what the materials remember, of snow ln J_P; with
+        snow also J_P (f, q, 2), the least and the greatest of its grains.
         """
         scene = self.scene
         b = scene.bodies
@@ -117,13 +125,42 @@ class Ledger:
             "mass_start_kg": float(data["mass"][0]),
             "mass_end_kg": float(data["mass"][-1]),
             "mass_left_kg": float(data["mass_left"][-1]),
-            "top_of_grains_m": float(np.max(data["snapshot_x"][-1][here, 2], initial=-np.inf)),
+            "top_of_grains_m": float(np.max(data["snapshot_x"][-1][here, 2])) if here.any() else None,
             "fastest_grain_m_s": float(np.max(np.linalg.norm(data["snapshot_v"][-1][here], axis=-1), initial=0.0)),
             "body_end_m": {
                 str(name): data["body_position"][-1, i].tolist() for i, name in enumerate(data["body_names"]) if i
             },
             "forces_of_grains": forces,
+            "snow": self._packing(),
         }
+
+    def _packing(self) -> list[dict[str, float]]:
+        """Least and greatest plastic volume ratio J_P of each snow over the run, and where its hardening ends."""
+        found = []
+        for q, k in enumerate(self._snow):
+            J_P, material = np.asarray(self.frames["J_P"])[:, q], self.scene.config.grains[k].material
+            assert isinstance(material, SnowConfig)
+            found.append({"J_P_least": float(J_P.min()), "J_P_greatest": float(J_P.max()), "Jp_min": material.Jp_min})
+        return found
+
+    def _of_mass(self, state: State) -> dict[str, float]:
+        """Mass there and mass gone, grain by grain: together they are the mass at the start to the last bit."""
+        m = np.asarray(state.grains.m)
+        if self._start is None:
+            self._start = m
+        return {"mass": float(total(m)), "mass_left": float(total(self._start[m == 0]))}
+
+    def _of_snow(self, state: State) -> dict[str, Any]:
+        """Least and greatest J_P of the grains of each snow, 1 where none is there."""
+        if not self._snow:
+            return {}
+        m, history = np.asarray(state.grains.m), np.asarray(state.grains.history, float)
+        rows = []
+        for k in self._snow:
+            a, b = self.scene.spans[k]
+            J_P = np.exp(history[0, a:b][m[a:b] > 0])
+            rows.append((J_P.min(), J_P.max()) if len(J_P) else (1.0, 1.0))
+        return {"J_P": np.asarray(rows)}
 
     def _of_grains(self, state: State) -> dict[str, Any]:
         scene = self.scene
@@ -134,7 +171,6 @@ class Ledger:
         if scene.dimension == 2:  # the plane's (x, z) turn about minus y
             turning = np.array([0.0, -turning[2], 0.0])
         return {
-            "mass": float(sums.mass),
             "momentum": momentum,
             "angular_momentum": turning + np.cross(origin, momentum),
             "kinetic": float(sums.kinetic),

@@ -1,8 +1,8 @@
 """Recordings: what a run did, as one Rerun file that can be looked at, read back and simulated again.
 
 A file holds the recipe of the run (everything a re-simulation needs), every action in float64, and per frame
-the grains in float32, the bodies' poses, the wrenches on the tools, and named scalars. It is flushed frame by
-frame, so a killed run leaves a readable file. Only the modules called log import rerun, and only when used.
+the grains in float32, the bodies' poses in float64, the wrenches on the tools, and named scalars. It is flushed
+frame by frame, so a killed run leaves a readable file. Only the modules called log import rerun, and only when used.
 """
 
 import hashlib
@@ -119,7 +119,8 @@ class Recorder:
             grains: (n, 3) float32 m, kept to the bit; n may change; NaN is kept, and its colour is magenta.
             values: (n,) the quantity that colours the grains.
             grain_radius: drawn radius, m.
-            geom_pos, geom_mat: (g, 3) m and (g, 3, 3) of all geoms of the model, as `MjData.geom_xpos`.
+            geom_pos, geom_mat: (g, 3) m and (g, 3, 3) of all geoms of the model, as `MjData.geom_xpos`; kept to the
+                bit in float64. Needed where the model has geoms.
             wrenches: name -> point (3,) m, force (3,) N, torque (3,) N m about the point, in the world frame.
             scalars: "group/name_unit" -> value, such as "reward/deliver" or "budget/mass_kg"; NaN is kept.
 
@@ -139,6 +140,7 @@ class Recorder:
         wrenches = wrenches or {}
         plots = _wrench_scalars(wrenches) | {k: _scalar(k, v) for k, v in (scalars or {}).items()}
         poses = self._poses(geom_pos, geom_mat)
+        exact = {"time_s": float(time)} | ({} if poses is None else {"pose": poses.ravel()})
 
         rr = rerun()
         with _strict(self._path):
@@ -146,10 +148,12 @@ class Recorder:
                 self._rec.send_blueprint(log_look.blueprint(list(plots), self._view))
             self._rec.set_time("step", sequence=int(step))
             self._rec.set_time("sim_time", duration=float(time))
-            # The timeline counts nanoseconds, so the exact time travels with the grains.
+            # The timeline counts nanoseconds and a drawn pose is f32, so the exact ones travel with the grains.
             points = rr.Points3D(grains, colors=log_look.colours(values, self._range), radii=[grain_radius])
-            self._rec.log("world/grains", points, _own(time_s=float(time)))
-            for path, position, rotation in poses:
+            self._rec.log("world/grains", points, _own(**exact))
+            for geom, path in self._moving_geoms.items():
+                assert poses is not None
+                position, rotation = poses[geom, :3], poses[geom, 3:].reshape(3, 3)
                 self._rec.log(path, rr.Transform3D(translation=position, mat3x3=rotation))
             for name, (point, force, _) in wrenches.items():
                 arrow = np.asarray(force) * self._scale
@@ -201,21 +205,19 @@ class Recorder:
         if not self._open:
             raise ValueError(f"the recorder of {self._path} is closed: start another one to record more.")
 
-    def _poses(self, geom_pos: Any, geom_mat: Any) -> list[tuple[str, np.ndarray, np.ndarray]]:
-        """Entity path, position and rotation of every moving geom."""
-        if not self._moving_geoms:
-            return []
-        assert self._model is not None
+    def _poses(self, geom_pos: Any, geom_mat: Any) -> np.ndarray | None:
+        """Position and rotation by rows of every geom, (g, 12) float64; None without geoms."""
+        if self._model is None or not self._model.ngeom:
+            return None
         count = self._model.ngeom
-        position = np.asarray(geom_pos if geom_pos is not None else ())
-        rotation = np.asarray(geom_mat if geom_mat is not None else ())
+        position = np.asarray(geom_pos if geom_pos is not None else (), np.float64)
+        rotation = np.asarray(geom_mat if geom_mat is not None else (), np.float64)
         if position.shape != (count, 3) or rotation.shape not in ((count, 3, 3), (count, 9)):
             raise ValueError(
-                f"geom_pos is {position.shape} and geom_mat {rotation.shape}: the model has moving bodies, "
+                f"geom_pos is {position.shape} and geom_mat {rotation.shape}: the model has geoms, "
                 f"so give ({count}, 3) and ({count}, 3, 3)."
             )
-        rotation = rotation.reshape(count, 3, 3)
-        return [(path, position[geom], rotation[geom]) for geom, path in self._moving_geoms.items()]
+        return np.concatenate([position, rotation.reshape(count, 9)], axis=1)
 
 
 @contextmanager

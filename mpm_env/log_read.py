@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -49,6 +49,7 @@ class Recording:
     steps: np.ndarray  # (f,) int64
     times: np.ndarray  # (f,) float64 s
     grains: list[np.ndarray]  # f times (n_i, 3) float32 m
+    poses: list[np.ndarray]  # f times (g, 12) float64, every geom's position in m and rotation by rows; g = 0 without
     action_steps: np.ndarray  # (k,) int64, the step each action was applied from
     actions: np.ndarray  # (k, a) float64
     scalars: dict[str, tuple[np.ndarray, np.ndarray]]  # name -> steps (j,) int64, values (j,) float64
@@ -56,7 +57,7 @@ class Recording:
 
 
 def read(path: str | os.PathLike[str]) -> Recording:
-    """Read a recording back: recipe, actions and grains to the bit.
+    """Read a recording back: recipe, actions, grains and poses to the bit.
 
     A file whose writer was killed, or that was cut short, gives what it holds, with `complete` False.
 
@@ -73,14 +74,15 @@ def read(path: str | os.PathLike[str]) -> Recording:
     else:
         rows = _read_rows(path, path)
     recipe = _checked_recipe(path, rows)
-    rows.frames.sort(key=lambda frame: frame[0])
+    rows.frames.sort(key=lambda frame: frame.step)
     rows.actions.sort(key=lambda action: action[0])
     size = rows.actions[0][1].size if rows.actions else 0
     return Recording(
         recipe=recipe,
-        steps=np.array([step for step, _, _ in rows.frames], np.int64),
-        times=np.array([time for _, _, time in rows.frames], np.float64),
-        grains=[place for _, place, _ in rows.frames],
+        steps=np.array([frame.step for frame in rows.frames], np.int64),
+        times=np.array([frame.time for frame in rows.frames], np.float64),
+        grains=[frame.grains for frame in rows.frames],
+        poses=[frame.poses for frame in rows.frames],
         action_steps=np.array([step for step, _ in rows.actions], np.int64),
         actions=np.array([action for _, action in rows.actions], np.float64).reshape(len(rows.actions), size),
         scalars={name: _series(pairs) for name, pairs in sorted(rows.scalars.items())},
@@ -121,6 +123,15 @@ def open_viewer(path: str | os.PathLike[str]) -> None:
         )
 
 
+class _Frame(NamedTuple):
+    """A row of world/grains."""
+
+    step: int
+    time: float  # s
+    grains: np.ndarray  # (n, 3) float32 m
+    poses: np.ndarray  # (g, 12) float64
+
+
 @dataclass
 class _Rows:
     """What the chunks of a file held, in the file's order."""
@@ -128,7 +139,7 @@ class _Rows:
     application: str = APPLICATION
     run: dict[str, Any] = field(default_factory=dict)
     end: dict[str, Any] = field(default_factory=dict)
-    frames: list[tuple[int, np.ndarray, float]] = field(default_factory=list)
+    frames: list[_Frame] = field(default_factory=list)
     actions: list[tuple[int, np.ndarray]] = field(default_factory=list)
     scalars: dict[str, list[tuple[int, float]]] = field(default_factory=dict)
 
@@ -142,8 +153,10 @@ class _Rows:
         elif "step" not in names:
             return
         elif entity == "/world/grains" and OWN + "time_s" in names:
-            for step, place, time in _cells(batch, "Points3D:positions", OWN + "time_s"):
-                self.frames.append((step, place.reshape(-1, 3), float(time[0])))
+            posed = [OWN + "pose"] if OWN + "pose" in names else []  # a model without geoms has none
+            for step, place, time, *pose in _cells(batch, "Points3D:positions", OWN + "time_s", *posed):
+                poses = pose[0] if pose else np.zeros(0)
+                self.frames.append(_Frame(step, float(time[0]), place.reshape(-1, 3), poses.reshape(-1, 12)))
         elif entity == "/control/action" and OWN + "action" in names:
             self.actions += _cells(batch, OWN + "action")
         elif entity.startswith("/plots/") and "Scalars:scalars" in names:

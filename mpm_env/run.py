@@ -6,7 +6,8 @@ import json
 import math
 import os
 import platform
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
@@ -23,12 +24,14 @@ from mpm_env.health import Health, names, sentences
 from mpm_env.ledger import Ledger
 from mpm_env.log import COLOUR_RANGES, Recorder
 from mpm_env.render import save_png
-from mpm_env.scene import WHOLE, Scene, State, build, initial
+from mpm_env.scene import Scene, State, build, initial
 from mpm_env.scene_config import SceneConfig
+from mpm_env.scene_grains import whole
 from mpm_env.sim import advance, scripted
 from mpm_env.view import View, camera_of, no_reactions, write_frame
 
-FILES = ("run.rrd", "run.npz", "run.png", "summary.json")
+RECORDING = "run.rrd"
+FILES = (RECORDING, "run.npz", "run.png", "summary.json")
 PICTURE = 960, 640  # pixels
 CUT_SHORT = "cut short: the process ended before the run did"
 MOST_SEED = 2**32 - 1
@@ -47,30 +50,25 @@ def rhythm_of(scene: Scene, fps: float, snapshots_fps: float | None = None) -> R
     dt, duration = scene.rigid_dt, scene.config.duration
     if not 0 < fps < math.inf:
         raise ValueError(f"fps = {fps:.6g} is no number of frames per second: use 25 or so.")
-    per_frame = _whole(1 / (fps * dt))
+    per_frame = whole(1 / (fps * dt))
     if per_frame is None:
         at_most = max(math.floor(1 / (fps * dt)), 1)
         raise ValueError(
             f"A frame at fps = {fps:.6g} is not a whole number of rigid steps of {dt:.6g} s: use fps ="
             f" {1 / (at_most * dt):.6g}."
         )
-    frames = _whole(duration * fps)
+    frames = whole(duration * fps)
     if frames is None:
         raise ValueError(
             f"duration = {duration:.6g} s is {duration * fps:.4g} frames at fps = {fps:.6g}: make it a whole"
             f" number, such as {max(round(duration * fps), 1) / fps:.6g} s."
         )
     per_snapshot = None
-    if snapshots_fps is not None and not (snapshots_fps > 0 and (per_snapshot := _whole(fps / snapshots_fps))):
+    if snapshots_fps is not None and not (snapshots_fps > 0 and (per_snapshot := whole(fps / snapshots_fps))):
         raise ValueError(
             f"snapshots_fps = {snapshots_fps:.6g} does not divide fps = {fps:.6g}: use {fps:.6g} or half of it."
         )
     return Rhythm(per_frame, frames, per_snapshot)
-
-
-def _whole(ratio: float) -> int | None:
-    n = round(ratio)
-    return n if n >= 1 and abs(ratio - n) < WHOLE * n else None
 
 
 def run(
@@ -128,23 +126,20 @@ def prepare(
         raise ValueError(f"seed = {seed} is outside 0..{MOST_SEED}: use a seed in that range.")
     camera = camera_of(scene)
     state = initial(scene, jax.random.key(seed))
-    is_new = not Path(out).exists()
-    path = folder(out, FILES)
-    recorder = None
-    try:
+    with folder(out, FILES) as path:
+        recorder = None
         if record:
             recorder = Recorder(
-                path / "run.rrd",
+                path / RECORDING,
                 recipe=recipe(scene, seed=seed, steps_per_frame=rhythm.steps_per_frame),
                 model=scene.bodies.model if scene.bodies else None,
                 box=(config.box.lower, config.box.upper),
                 quantity=quantity,
                 view=(camera.eye, camera.target),
             )
-    except ValueError:
-        if is_new:
-            path.rmdir()
-        raise
+    for name in FILES:
+        if recorder is None or name != RECORDING:
+            (path / name).unlink(missing_ok=True)
     session = Session(scene, state, rhythm, path, recorder, seed, fps, quantity)
     session.wall["build"] = perf_counter() - began
     session.summarise(CUT_SHORT)
@@ -322,16 +317,29 @@ def _own_version() -> str:
         return "not installed"
 
 
-def folder(out: str | os.PathLike[str], files: Sequence[str]) -> Path:
-    """The folder for results, made if need be and rid of these files of an earlier run."""
+@contextmanager
+def folder(out: str | os.PathLike[str], files: Sequence[str]) -> Iterator[Path]:
+    """The folder for results, made if need be, and gone again if what is done in the block is refused.
+
+    Raises ValueError where these files cannot go into it. Those of an earlier run stay as they are.
+    """
     path = Path(out)
+    made = [p for p in (path, *path.parents) if not p.exists()]
     try:
         path.mkdir(parents=True, exist_ok=True)
-        for name in files:
-            (path / name).unlink(missing_ok=True)
     except OSError as error:
         raise ValueError(f"The folder {path} cannot be written: {error.strerror}.") from None
-    return path
+    if not os.access(path, os.W_OK | os.X_OK):
+        raise ValueError(f"The folder {path} cannot be written: you lack the permission.")
+    for name in files:
+        if (path / name).is_dir():
+            raise ValueError(f"{path / name} is a folder, and a file is to go there: remove it or use another folder.")
+    try:
+        yield path
+    except (ValueError, TypeError):
+        for p in made:
+            p.rmdir()
+        raise
 
 
 def _finite(value: Any) -> Any:

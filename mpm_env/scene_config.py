@@ -37,6 +37,12 @@ class WallConfig(Section):
     kind: Literal["slip", "stick", "separate", "open"] = "slip"
     friction: NotNegative = 0.0  # only for "separate"
 
+    @model_validator(mode="after")
+    def _rubs(self) -> WallConfig:
+        if self.friction and self.kind != "separate":
+            raise ValueError(f"a wall of kind {self.kind!r} has no friction, got {self.friction}: use 'separate'")
+        return self
+
 
 class ElasticConfig(Section):
     """Elastic solid."""

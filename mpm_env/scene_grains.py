@@ -17,6 +17,12 @@ from mpm_env.scene_config import BoxFill, CylinderFill, MaterialConfig, SceneCon
 WHOLE = 1e-6  # how far from a whole number a ratio of two lengths or times may be, for rounding in the inputs
 
 
+def whole(ratio: float) -> int | None:
+    """The whole number from 1 up that a ratio is, rounding in the inputs aside; None where it is none."""
+    n = round(ratio)
+    return n if n >= 1 and abs(ratio - n) < WHOLE * n else None
+
+
 def axes_of(d: int) -> list[int]:
     """The world axes that a grid of d dimensions has: x and z in plane strain."""
     return [0, 2] if d == 2 else [0, 1, 2]

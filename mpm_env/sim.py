@@ -18,7 +18,7 @@ from coupling import bodies as rigid
 from coupling.bodies import Stance
 from coupling.contact import Points, distances
 from coupling.exchange import Exchange, exchange
-from coupling.geoms import bounding_radius
+from coupling.geoms import Shape, bounding_radius, half_extents
 from mpm_env.health import MOST_DEPTH, MOST_TRAVEL, Health
 from mpm_env.mpm.budgets import mass_that_left
 from mpm_env.mpm.stability import MOST_CELLS_PER_SUBSTEP
@@ -26,6 +26,7 @@ from mpm_env.mpm.substep import substep
 from mpm_env.mpm.types import Particles
 from mpm_env.scene import NODE_DEPTH, Scene, State, inside_grid, lift
 
+HALFWAY = 0.5  # of the way to a thin geom's middle, from where a grain is about to come out on the other side
 MOST_RESIDUAL = 0.1  # share of the exchange's equation that may stay unsolved before it is called not converged
 
 
@@ -53,18 +54,13 @@ def advance(scene: Scene, state: State, drives: Drive) -> tuple[State, Array]:
     """As many rigid steps as the drives have rows. Returns the state and each step's reaction (k, G, 6) N, N m."""
 
     def one(state: State, drive: Drive) -> tuple[State, Array]:
-        state = step(scene, state, drive)
+        state = rigid_step(scene, state, drive)
         return state, state.reaction
 
     return lax.scan(one, state, drives)
 
 
-def repeat(scene: Scene, state: State, drive: Drive, count: int) -> State:
-    """`count` rigid steps under one drive."""
-    return lax.fori_loop(0, count, lambda _, s: step(scene, s, drive), state)
-
-
-def step(scene: Scene, state: State, drive: Drive) -> State:
+def rigid_step(scene: Scene, state: State, drive: Drive) -> State:
     """One rigid step with its substeps."""
     if scene.bodies is None:
         grains = _run_grains(scene, state)
@@ -148,7 +144,8 @@ class Contact(NamedTuple):
         near, used, over = _pick((phi < band) & (phi > -NODE_DEPTH * dx), scene.sizes.nodes)
         if scene.sizes.grains and scene.slots:
             phi = distances(b.shapes, scene.world(p.x).T, pos, mat)[0]
-            grains = _pick((phi < MOST_TRAVEL * dx) & (p.m > 0), scene.sizes.grains)
+            travel = scene.rigid_dt * jnp.sqrt(jnp.sum(p.v * p.v, axis=0))
+            grains = _pick((phi < MOST_TRAVEL * dx + travel) & (p.m > 0), scene.sizes.grains)
         else:
             grains = (jnp.zeros((0,), jnp.int32), jnp.zeros((0,), bool), jnp.zeros((), bool))
         return cls(scene, stance, near, used, nodes[near], over, *grains)
@@ -207,7 +204,7 @@ class Contact(NamedTuple):
         speed = jnp.linalg.norm(twist[:, :3], axis=-1) + reach * jnp.linalg.norm(twist[:, 3:], axis=-1)
         return _bits(
             {
-                Health.TOO_DEEP: touch.depth > MOST_DEPTH * dx,
+                Health.TOO_DEEP: touch.depth > min(MOST_DEPTH * dx, *(HALFWAY * _half_thickness(s) for s in b.shapes)),
                 Health.NODES_OVERFLOW: self.nodes_over,
                 Health.GRAINS_OVERFLOW: self.grains_over,
                 Health.NOT_CONVERGED: touch.residual > MOST_RESIDUAL,
@@ -256,6 +253,11 @@ class Contact(NamedTuple):
         return a if self.scene.dimension == 3 else a[:, ::2]
 
 
+def _half_thickness(shape: Shape) -> float:
+    """Half the smallest side of a geom, m: how deep a grain can be before it is nearer to the other side."""
+    return float(np.min(half_extents(shape)))
+
+
 def _reach(b: rigid.Bodies, body: int) -> float:
     """How far a body's coupled geoms reach from its centre of mass, m; planes count as nothing."""
     centre = b.model.body_ipos[b.bodies[body]]
@@ -284,14 +286,15 @@ def _bits(faults: dict[Health, Array]) -> Array:
 def _examined(scene: Scene, before: State, after: State, contact: Array | int) -> State:
     """The state after a rigid step, with what is wrong with it and what left through open walls."""
     p, dx = after.grains, scene.grid.cell_size
+    finite = jnp.ones((), bool)
+    if after.rigid is not None:
+        finite = jnp.all(jnp.isfinite(after.rigid.qpos)) & jnp.all(jnp.isfinite(after.rigid.qvel))
     if not scene.slots:
-        return replace(after, health=after.health | contact)
+        return replace(after, health=after.health | contact | _bits({Health.NOT_FINITE: ~finite}))
+    finite &= jnp.isfinite(jnp.sum(p.x) + jnp.sum(p.v) + jnp.sum(p.e))
     here = p.m > 0
     speed2 = jnp.where(here, jnp.sum(p.v * p.v, axis=0), 0)
     turning2 = jnp.where(here, jnp.sum(p.C * p.C, axis=(0, 1)), 0)
-    finite = jnp.isfinite(jnp.sum(p.x) + jnp.sum(p.v) + jnp.sum(p.e))
-    if after.rigid is not None:
-        finite &= jnp.all(jnp.isfinite(after.rigid.qpos)) & jnp.all(jnp.isfinite(after.rigid.qvel))
     bits = _bits(
         {
             Health.NOT_FINITE: ~finite,

@@ -46,6 +46,13 @@ class View:
         material = np.searchsorted(starts, slots, side="right") - 1
         return cls(scene, time, slots, x.T.astype(np.float32), speed, material, body_data(scene, state))
 
+    @property
+    def poses(self) -> np.ndarray:
+        """Position in m and rotation by rows of every geom, (g, 12)."""
+        if self.data is None:
+            return np.zeros((0, 12))
+        return np.concatenate([self.data.geom_xpos, self.data.geom_xmat], axis=1)
+
     def values(self, quantity: str) -> np.ndarray:
         """What colours the grains in a recording, (n,): "speed", "height" or "material"."""
         return {"speed": self.speed, "height": self.grains[:, 2], "material": self.material}[quantity]

@@ -26,8 +26,8 @@ def courant_limit(nu: float, dimension: int) -> float:
 
     A lone grain oscillates on its own window with dt < dx / sqrt(d K' / rho), K' = lam + 2 mu / d, wherever it sits in
     its cell; with c^2 = (lam + 2 mu) / rho the Courant number is sqrt((lam + 2 mu) / (d lam + 2 mu)). Derived for
-    quadratic B-splines. Ragged blocks bear a little more: at one grain per cell the weakest of 48 (nu 0 to 0.45, 2-D
-    and 3-D) broke at 1.03 times this, with 2^d grains per cell at 1.12.
+    quadratic B-splines. Ragged blocks bear a little more: at one grain per cell the weakest of those measured (nu 0 to
+    0.45, 2-D and 3-D) broke at 1.03 times this, with 2^d grains per cell at 1.12.
     """
     lam, mu = nu / (1 - 2 * nu), 0.5  # both over E / (1 + nu)
     return SAFETY * math.sqrt((lam + 2 * mu) / (dimension * lam + 2 * mu))

@@ -17,6 +17,7 @@ from mpm_env.mpm.materials import Material
 from mpm_env.mpm.transfer import CHUNK, each_chunk, g2p, p2g
 from mpm_env.mpm.types import MARGIN, Grid, Particles
 
+LEAST_SPEED2 = 1e-30  # (m/s)^2, guards the direction of sliding at rest
 LEAST_MASS = 1e-30  # kg: below this a node's velocity is nothing but rounding, and f32 flushes its mass to zero
 
 
@@ -90,7 +91,7 @@ def walls(grid: Grid, v: Array) -> Array:
                 rows = [jnp.where(behind, 0, row) for row in rows]
             elif wall.kind == "separate":
                 into = jnp.where(behind, jnp.maximum(-inward * rows[a], 0), 0)
-                speed = jnp.sqrt(sum(rows[i] ** 2 for i in range(d) if i != a) + LEAST_MASS)
+                speed = jnp.sqrt(sum(rows[i] ** 2 for i in range(d) if i != a) + LEAST_SPEED2)
                 keep = jnp.maximum(1 - wall.friction * into / speed, 0)  # Coulomb: at most mu times the normal impulse
                 rows = [row + inward * into if i == a else row * keep for i, row in enumerate(rows)]
     return jnp.stack(rows, axis=-1)

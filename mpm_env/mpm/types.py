@@ -46,8 +46,8 @@ class Particles:
 class Wall:
     """One side of the box.
 
-    slip: no motion through it, free along it. stick: no motion at all. separate: material may leave it, and rubs on
-    it with Coulomb friction. open: grains that cross are counted and taken out.
+    slip: no motion through it, either way, and free along it. stick: no motion at all. separate: material may leave it,
+    and rubs on it with Coulomb friction. open: grains that cross are counted and taken out.
     """
 
     kind: str = "slip"

@@ -13,9 +13,19 @@ from scipy.interpolate import PchipInterpolator
 
 from mpm_env.mpm.budgets import height_map
 from mpm_env.scene import Scene, State, initial
-from mpm_env.tasks.protocol import TaskConfig, Tool, geom_wrench, in_body, kilograms, within
+from mpm_env.tasks.protocol import (
+    TaskConfig,
+    Tool,
+    geom_wrench,
+    in_body,
+    kilograms,
+    moved_targets,
+    site_twist,
+    within,
+)
 
 BED_TOP = 0.20  # m, mean height of the bed
+BED_UNTIL = 0.82  # m, x where the partition begins
 BIN_FROM = 0.85  # m, x beyond which the bin is
 BIN_TOP = 0.3  # m, below which sand behind the partition is in the bin
 MAP_LOWER, MAP_UPPER, MAP_COLUMNS = (0.0, -0.2), (1.2, 0.2), (24, 8)
@@ -42,7 +52,8 @@ class Dig:
         wrench      (3,)     N, N, N m: what the material does to the bucket along x, along z and about its middle,
                              mean over the last action
         height_map  (24, 8)  m: top of the material over x 0..1.2, y -0.2..0.2
-        mass        (3,)     kg: in the bucket, in the bin, gone from the box
+        mass        (4,)     kg: in the bucket, moved out of the bed, spilled (moved, but neither in the bucket nor
+                             beyond the partition), in the bin
     """
 
     config: TaskConfig
@@ -74,16 +85,13 @@ class Dig:
 
     def targets(self, state: State, action: Array) -> Array:
         """Joint targets after an action, inside the actuators' ranges."""
-        assert self.scene.bodies is not None
-        low, high = self.scene.bodies.model.actuator_ctrlrange.T
-        return jnp.clip(state.rigid.ctrl + self.config.control_dt * RATES * action, low, high)
+        return moved_targets(self, state, action)
 
     def observation(self, state: State, tool: Tool) -> dict[str, Array]:
         """See the class."""
         d = state.rigid
         body, tip = self._ids
-        lever = d.site_xpos[tip] - d.subtree_com[self._root]
-        v = d.cvel[body, 3:] + jnp.cross(d.cvel[body, :3], lever)
+        v, w = site_twist(self.scene, state, "bucket_tip")
         R, at = d.xmat[body], d.site_xpos[tip]
         tilt = jnp.arctan2(-R[2, 0], -R[0, 0])
         grains = state.grains
@@ -91,21 +99,16 @@ class Dig:
         return {
             "joints": jnp.concatenate([d.qpos, d.qvel]),
             "targets": d.ctrl,
-            "tool": jnp.stack([at[0], at[2], tilt, v[0], v[2], -d.cvel[body, 1]]),
+            "tool": jnp.stack([at[0], at[2], tilt, v[0], v[2], -w[1]]),
             "wrench": jnp.stack([tool.force[0], tool.force[2], tool.torque[1]]),
             "height_map": height_map(
                 self.scene.world(grains.x), grains.m, lower=MAP_LOWER, upper=MAP_UPPER, columns=MAP_COLUMNS, floor=0.0
             ),
-            "mass": jnp.stack([facts["bucket_kg"], facts["bin_kg"], facts["gone_kg"]]),
+            "mass": jnp.stack([facts[k] for k in ("bucket_kg", "moved_kg", "spilled_kg", "bin_kg")]),
         }
 
-    @cached_property
-    def _root(self) -> int:
-        assert self.scene.bodies is not None
-        return int(self.scene.bodies.model.body_rootid[self._ids[0]])
-
     def facts(self, state: State) -> dict[str, Array]:
-        """Masses in the bucket, in the bin and gone, in kg; height of the bucket's edge, in m."""
+        """Masses in the bucket, moved, spilled and in the bin, in kg; where the bucket's edge is, in m."""
         grains = state.grains
         body, tip = self._ids
         x = self.scene.world(grains.x)
@@ -114,27 +117,30 @@ class Dig:
         for (x0, z0), (x1, z1) in zip(RIM, (*RIM[1:], RIM[0]), strict=True):
             inside &= (x1 - x0) * (local[2] - z0) - (z1 - z0) * (local[0] - x0) <= 0
         inside &= x[2] > BED_TOP  # sand in the bed around a lowered bucket is not a load
+        bucket, past = kilograms(grains.m, inside), ~inside & (x[0] > BED_UNTIL)
         return {
-            "bucket_kg": kilograms(grains.m, inside),
-            "bin_kg": kilograms(grains.m, (x[0] > BIN_FROM) & (x[2] < BIN_TOP) & ~inside),
-            "gone_kg": state.left,
+            "bucket_kg": bucket,
+            "moved_kg": bucket + kilograms(grains.m, past) + state.left,
+            "spilled_kg": kilograms(grains.m, past & (x[0] < BIN_FROM)) + state.left,
+            "bin_kg": kilograms(grains.m, past & (x[0] > BIN_FROM) & (x[2] < BIN_TOP)),
             "edge_z_m": state.rigid.site_xpos[tip][2],
             "edge_x_m": state.rigid.site_xpos[tip][0],
         }
 
     def terms(self, facts: dict[str, Array], tool: Tool) -> dict[str, Array]:
-        """approach: the edge over the bed. load: bucket against target. lift: load brought up. deliver: bin against
-        target. keep: nothing lost. gentle: low forces."""
+        """approach: the edge over the bed. load: bucket and bin against target. lift: load brought up or
+        delivered. deliver: bin against target. keep: nothing spilled. gentle: low forces."""
         target = self.config.target_kg
-        load = within(facts["bucket_kg"], target)
+        load = within(facts["bucket_kg"] + facts["bin_kg"], target)
+        delivered = within(facts["bin_kg"], target)
         over_bed = jnp.maximum(facts["edge_x_m"] - 0.8, 0) + jnp.maximum(0.1 - facts["edge_x_m"], 0)
         away = jnp.hypot(over_bed, jnp.maximum(facts["edge_z_m"] - BED_TOP, 0))
         return {
             "approach": jnp.maximum(1 - within(away, 0.5), load),
             "load": load,
-            "lift": load * within(facts["edge_z_m"] - BED_TOP, CARRY_HEIGHT - BED_TOP),
-            "deliver": within(facts["bin_kg"], target),
-            "keep": 1 - within(facts["gone_kg"], target),
+            "lift": jnp.maximum(load * within(facts["edge_z_m"] - BED_TOP, CARRY_HEIGHT - BED_TOP), delivered),
+            "deliver": delivered,
+            "keep": 1 - within(facts["spilled_kg"], target),
             "gentle": 1 - within(jnp.linalg.norm(tool.force), STRONG),
         }
 

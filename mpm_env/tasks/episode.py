@@ -18,7 +18,18 @@ from mpm_env.tasks.protocol import Task, Tool
 
 @partial(
     jax.tree_util.register_dataclass,
-    data_fields=["state", "actions", "observation", "reward", "terms", "facts", "tool", "terminated", "truncated"],
+    data_fields=[
+        "state",
+        "actions",
+        "reactions",
+        "observation",
+        "reward",
+        "terms",
+        "facts",
+        "tool",
+        "terminated",
+        "truncated",
+    ],
     meta_fields=[],
 )
 @dataclass(frozen=True)
@@ -27,6 +38,7 @@ class Episode:
 
     state: State
     actions: Array  # () int32, how many were taken
+    reactions: Array  # (G, 6) N and N m on each coupled geom about its body's centre, mean over the last action
     observation: dict[str, Array]  # float32
     reward: Array  # () float32, in [0, 1]
     terms: dict[str, Array]  # () each, in [0, 1]
@@ -39,8 +51,7 @@ class Episode:
 def reset(task: Task, key: Array) -> Episode:
     """The start of an episode: everything random comes from the key."""
     state = task.initial(key)
-    zero = jnp.zeros((3,), task.scene.dtype)
-    return _told(task, state, jnp.zeros((), jnp.int32), Tool(zero, zero))
+    return _told(task, state, jnp.zeros((), jnp.int32), state.reaction)
 
 
 def step(task: Task, episode: Episode, action: Array) -> Episode:
@@ -54,8 +65,7 @@ def step(task: Task, episode: Episode, action: Array) -> Episode:
     share = (jnp.arange(count, dtype=now.dtype) + 1) / count
     still = [jnp.broadcast_to(a, (count, *a.shape)) for a in (state.rigid.mocap_pos, state.rigid.mocap_quat)]
     state, reactions = advance(task.scene, state, Drive(now + share[:, None] * (then - now), *still))
-    tool = task.wrench(state, jnp.mean(reactions, axis=0))
-    return _told(task, state, episode.actions + 1, tool)
+    return _told(task, state, episode.actions + 1, jnp.mean(reactions, axis=0))
 
 
 def scripted_action(task: Task, episode: Episode) -> np.ndarray:
@@ -79,8 +89,9 @@ def actions_per_episode(task: Task) -> int:
     return round(task.config.time_limit / task.config.control_dt)
 
 
-def _told(task: Task, state: State, actions: Array, tool: Tool) -> Episode:
-    """What an agent is told of a state. A sick state is truncated, and its numbers are kept finite."""
+def _told(task: Task, state: State, actions: Array, reactions: Array) -> Episode:
+    """What an agent is told of a state. A sick state is no success, is truncated, and its numbers are kept finite."""
+    tool = task.wrench(state, reactions)
     f32 = partial(jnp.asarray, dtype=jnp.float32)
     facts = {k: f32(v) for k, v in task.facts(state).items()}
     terms = {k: f32(v) for k, v in task.terms(facts, tool).items()}
@@ -89,14 +100,16 @@ def _told(task: Task, state: State, actions: Array, tool: Tool) -> Episode:
     episode = Episode(
         state=state,
         actions=actions,
+        reactions=reactions,
         observation={k: f32(v) for k, v in task.observation(state, tool).items()},
         reward=reward,
         terms=terms,
         facts=facts,
         tool=tool,
-        terminated=task.success(facts) & ~lost,
+        terminated=task.success(facts) & (state.health == 0),
         truncated=(actions >= actions_per_episode(task)) | (state.health != 0),
     )
+    episode = replace(episode, truncated=episode.truncated & ~episode.terminated)
     clean = partial(jax.tree.map, lambda a: jnp.where(lost & ~jnp.isfinite(a), 0, a))
     return replace(
         episode,

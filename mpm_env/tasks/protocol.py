@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, NamedTuple, Protocol
+from typing import Annotated, Any, ClassVar, NamedTuple, Protocol
 
 import jax.numpy as jnp
 import numpy as np
@@ -35,10 +35,16 @@ class Tool(NamedTuple):
 class Task(Protocol):
     """A task over one scene. Pure: everything that changes is in the state."""
 
-    config: TaskConfig
-    scene: Scene
-    term_weights: dict[str, float]  # reward = sum of weight times term; weights sum to 1
-    rates: np.ndarray  # (a,) change of the actuator targets per second at full action
+    term_weights: ClassVar[dict[str, float]]  # reward = sum of weight times term; weights sum to 1
+    rates: ClassVar[np.ndarray]  # (a,) change of the actuator targets per second at full action
+
+    @property
+    def config(self) -> TaskConfig:
+        """What is asked."""
+
+    @property
+    def scene(self) -> Scene:
+        """What is simulated, and how finely."""
 
     @property
     def action_size(self) -> int:
@@ -81,6 +87,26 @@ def geom_wrench(scene: Scene, state: State, reaction: Array, site: str) -> Tool:
     wrench = jnp.sum(jnp.where(mine[:, None], reaction, 0), axis=0)
     lever = (state.rigid.xipos[at.bodyid[0]] - state.rigid.site_xpos[at.id]).astype(reaction.dtype)
     return Tool(wrench[:3], wrench[3:] + jnp.cross(lever, wrench[:3]))
+
+
+def moved_targets(task: Task, state: State, action: Array) -> Array:
+    """Actuator targets (nu,) after an action that sets their rates, inside the actuators' ranges."""
+    assert task.scene.bodies is not None
+    low, high = task.scene.bodies.model.actuator_ctrlrange.T
+    return jnp.clip(state.rigid.ctrl + task.config.control_dt * task.rates * action, low, high)
+
+
+def site_twist(scene: Scene, state: State, site: str) -> tuple[Array, Array]:
+    """Velocity (3,) m/s of a site and angular velocity (3,) rad/s of its body, in world axes.
+
+    MuJoCo's cvel is taken at the centre of mass of the kinematic tree.
+    """
+    assert scene.bodies is not None
+    model, d = scene.bodies.model, state.rigid
+    at = model.site(site)
+    body = int(at.bodyid[0])
+    w = d.cvel[body, :3]
+    return d.cvel[body, 3:] + jnp.cross(w, d.site_xpos[at.id] - d.subtree_com[int(model.body_rootid[body])]), w
 
 
 def within(x: Array, bound: float) -> Array:

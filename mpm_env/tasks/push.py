@@ -14,9 +14,10 @@ from scipy.interpolate import PchipInterpolator
 
 from mpm_env.mpm.budgets import height_map
 from mpm_env.scene import Scene, State, initial
-from mpm_env.tasks.protocol import TaskConfig, Tool, geom_wrench, kilograms, within
+from mpm_env.tasks.protocol import TaskConfig, Tool, geom_wrench, kilograms, moved_targets, site_twist, within
 
 GOAL_LOWER, GOAL_UPPER = (0.80, -0.20), (1.15, 0.20)  # m
+PILE_UNTIL = 0.55  # m, x beyond which no grain starts
 PILE_FROM, GOAL_MIDDLE = 0.4, 0.95  # m along x: where the pile's middle starts, and where it should be
 PILE_SHIFT = 0.03  # m, how far to either side a seed puts the pile
 MAP_LOWER, MAP_UPPER, MAP_COLUMNS = (0.0, -0.3), (1.2, 0.3), (24, 12)
@@ -38,7 +39,8 @@ class Push:
         wrench      (4,)      N, N, N, N m: what the material does to the blade along x, y and z, and about z, mean over
                               the last action
         height_map  (24, 12)  m: top of the material over x 0..1.2, y -0.3..0.3
-        mass        (3,)      kg: in the goal, behind the blade (spilled), gone from the box
+        mass        (3,)      kg: moved out of the pile's place, spilled (behind the blade, not in the goal; or gone),
+                              in the goal
     """
 
     config: TaskConfig
@@ -74,22 +76,19 @@ class Push:
 
     def targets(self, state: State, action: Array) -> Array:
         """Joint targets after an action, inside the actuators' ranges."""
-        assert self.scene.bodies is not None
-        low, high = self.scene.bodies.model.actuator_ctrlrange.T
-        return jnp.clip(state.rigid.ctrl + self.config.control_dt * RATES * action, low, high)
+        return moved_targets(self, state, action)
 
     def observation(self, state: State, tool: Tool) -> dict[str, Array]:
         """See the class."""
         d = state.rigid
         body, edge = self._ids
-        lever = d.site_xpos[edge] - d.subtree_com[self._root]
-        v = d.cvel[body, 3:] + jnp.cross(d.cvel[body, :3], lever)
+        v, w = site_twist(self.scene, state, "blade_edge")
         R, at = d.xmat[body], d.site_xpos[edge]
         facts = self.facts(state)
         return {
             "joints": jnp.concatenate([d.qpos, d.qvel]),
             "targets": d.ctrl,
-            "tool": jnp.stack([at[0], at[1], jnp.arctan2(R[1, 0], R[0, 0]), v[0], v[1], d.cvel[body, 2]]),
+            "tool": jnp.stack([at[0], at[1], jnp.arctan2(R[1, 0], R[0, 0]), v[0], v[1], w[2]]),
             "wrench": jnp.concatenate([tool.force, tool.torque[2:]]),
             "height_map": height_map(
                 self.scene.world(state.grains.x),
@@ -99,16 +98,11 @@ class Push:
                 columns=MAP_COLUMNS,
                 floor=0.0,
             ),
-            "mass": jnp.stack([facts["goal_kg"], facts["behind_kg"], facts["gone_kg"]]),
+            "mass": jnp.stack([facts[k] for k in ("moved_kg", "spilled_kg", "goal_kg")]),
         }
 
-    @cached_property
-    def _root(self) -> int:
-        assert self.scene.bodies is not None
-        return int(self.scene.bodies.model.body_rootid[self._ids[0]])
-
     def facts(self, state: State) -> dict[str, Array]:
-        """Masses in the goal, behind the blade and gone, in kg; the pile's mean x and distance to the blade, in m."""
+        """Masses moved, spilled and in the goal, in kg; the pile's mean x and distance to the blade, in m."""
         grains, d = state.grains, state.rigid
         x = self.scene.world(grains.x)
         at = d.site_xpos[self._ids[1]].astype(x.dtype)
@@ -119,9 +113,9 @@ class Push:
         mass = jnp.maximum(jnp.sum(grains.m), 1e-9)
         middle = jnp.sum(grains.m * x, axis=1) / mass
         return {
+            "moved_kg": kilograms(grains.m, x[0] > PILE_UNTIL) + state.left,
+            "spilled_kg": kilograms(grains.m, (ahead < 0) & ~in_goal) + state.left,
             "goal_kg": kilograms(grains.m, in_goal),
-            "behind_kg": kilograms(grains.m, (ahead < 0) & ~in_goal),
-            "gone_kg": state.left,
             "pile_x_m": middle[0],
             "reach_m": jnp.linalg.norm(middle[:2] - at[:2]),
         }
@@ -134,7 +128,7 @@ class Push:
             "approach": 1 - within(jnp.maximum(facts["reach_m"] - 0.15, 0), 0.5),
             "progress": within(facts["pile_x_m"] - PILE_FROM, GOAL_MIDDLE - PILE_FROM),
             "deliver": within(facts["goal_kg"], target),
-            "keep": 1 - within(facts["behind_kg"] + facts["gone_kg"], target),
+            "keep": 1 - within(facts["spilled_kg"], target),
             "gentle": 1 - within(jnp.linalg.norm(tool.force), STRONG),
         }
 

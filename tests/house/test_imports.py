@@ -35,7 +35,6 @@ FLOORS = {
     "mpm_env.render": 4,
     "mpm_env.replay": 4,
     "mpm_env.run": 4,
-    "mpm_env.train": 4,
     "mpm_env.view": 4,
     "mpm_env": 5,
 }

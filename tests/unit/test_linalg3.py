@@ -86,18 +86,6 @@ def test_derivative_of_an_isotropic_function_is_right_away_from_equal_values(d: 
 
 
 @each_dimension
-def test_reverse_derivative_is_finite_at_equal_values(d: int) -> None:
-    def total(e: jax.Array) -> jax.Array:
-        values, axes = eigen(e)
-        return jnp.sum(compose(axes, jnp.sin(values)) * jnp.arange(1.0, N + 1))
-
-    slope = jax.jit(jax.grad(total))
-    for even in (0.0, 1e-30, 1e-7, 3.0):
-        e = jnp.zeros((4 if d == 2 else 6, N)).at[:3].set(even)
-        assert np.isfinite(np.asarray(slope(e))).all()
-
-
-@each_dimension
 def test_rows_are_the_matrix(d: int) -> None:
     e = np.arange(1.0, 5.0 if d == 2 else 7.0)[:, None]
     matrix = np.array(matrix_rows(e))[..., 0]
