@@ -50,9 +50,9 @@ def prepare(
 ) -> Demo:
     """A demo that is ready to go: everything that can be refused has been checked. Arguments as for `demo`."""
     began = perf_counter()
-    env = GrainsEnv(task, fidelity)
     if seed < 0:
         raise ValueError(f"seed = {seed} is negative: use 0 or more.")
+    env = GrainsEnv(task, fidelity)
     built = perf_counter()
     env.reset(seed=seed)
     started = perf_counter()

@@ -70,8 +70,8 @@ class Ledger:
         x, v = (np.full((scene.slots, 3), np.nan, np.float32) for _ in range(2))
         x[view.slots] = view.grains
         v[view.slots] = _in_space(np.asarray(state.grains.v), scene)[view.slots]
-        row = {"time": view.time, "x": x, "v": v, "mass": np.asarray(state.grains.m)}
-        row["history"] = np.asarray(state.grains.history)
+        p = state.grains
+        row = {"time": view.time, "x": x, "v": v, "mass": np.asarray(p.m), "history": np.asarray(p.history)}
         for key, value in row.items():
             self.snapshots.setdefault(f"snapshot_{key}", []).append(value)
 
@@ -80,12 +80,12 @@ class Ledger:
 
         step, time s, health (f,); body_position (f, b, 3) m, body_quaternion (f, b, 4) w x y z, body_twist (f, b, 6)
         m/s and rad/s at the body's origin; qpos, qvel, control (f, nq | nv | nu); reaction_time (k,) s and reaction
-        (k, g, 6) N and N m about the body's centre of mass, mean over each rigid step; of the grains mass, and mass_left
-        of those that were there at the first frame and are gone (f,) kg, momentum (f, 3) kg m/s, angular_momentum (f, 3)
-        kg m^2/s about the world's origin, kinetic, elastic, potential (f,) J; the same of the bodies as bodies_*,
-        potential zero at z = 0; snapshot_time (s,) s, snapshot_x (s, n, 3) m, snapshot_v (s, n, 3) m/s, snapshot_mass
-        (s, n) kg, snapshot_material (n,), snapshot_history (s, h, n) what the materials remember, of snow ln J_P; with
-        snow also J_P (f, q, 2), the least and the greatest of its grains.
+        (k, g, 6) N and N m about the body's centre of mass, mean over each rigid step; of the grains mass, and
+        mass_left of those that were there at the first frame and are gone (f,) kg, momentum (f, 3) kg m/s,
+        angular_momentum (f, 3) kg m^2/s about the world's origin, kinetic, elastic, potential (f,) J; the same of the
+        bodies as bodies_*, potential zero at z = 0; snapshot_time (s,) s, snapshot_x (s, n, 3) m, snapshot_v (s, n, 3)
+        m/s, snapshot_mass (s, n) kg, snapshot_material (n,), snapshot_history (s, h, n) what the materials remember, of
+        snow ln J_P; with snow also J_P (f, q, 2), the least and the greatest of its grains.
         """
         scene = self.scene
         b = scene.bodies

@@ -40,6 +40,14 @@ class Motion:
         for name in config.motion:
             if name not in names:
                 raise ValueError(f"The model has no mocap body {name!r}{nearest(name, names)}")
+        for i, name in enumerate(actuators):
+            low, high = map(float, model.actuator_ctrlrange[i])
+            values = [value for _, value in config.controls.get(name, [])]
+            if values and model.actuator_ctrllimited[i] and not low <= min(values) <= max(values) <= high:
+                raise ValueError(
+                    f"The controls of {name!r} go from {min(values):.6g} to {max(values):.6g}, beyond its range of"
+                    f" {low:.6g} to {high:.6g}: stay inside it."
+                )
         start = _start_controls(config, model)
         controls = tuple(
             _curve(config.controls.get(name) or [(0.0, float(start[i]))], name) for i, name in enumerate(actuators)

@@ -17,6 +17,7 @@ from jax import Array
 
 from coupling.bodies import Bodies, couple, points_near, start
 from coupling.contact import distances
+from coupling.geoms import bounding_radius
 from mpm_env.config import nearest
 from mpm_env.fidelity import Fidelity
 from mpm_env.health import MOST_TRAVEL
@@ -28,11 +29,12 @@ from mpm_env.mpm.substep import Bed
 from mpm_env.mpm.transfer import CHUNK
 from mpm_env.mpm.types import MARGIN, Grid, Particles, Wall
 from mpm_env.scene_config import BodiesConfig, SceneConfig, Vec3
-from mpm_env.scene_grains import WHOLE, axes_of, fill_of, material_of
+from mpm_env.scene_grains import WHOLE, axes_of, fill_of, material_of, whole
 
 CROWDED = 1.5  # grains near a tool may be packed this much denser than at the start
 ICE = 917.0  # kg/m^3, beyond which no snow is packed
 ROOM = 1.3  # how many more nodes than counted at the start may be near a tool, for how it turns and lies in the grid
+NODE_DEPTH = 2.0  # cells inside a body down to which nodes are looked at: deeper ones carry no grains
 OVERLAP = 0.25  # cells that a grain may start inside a body: the jitter of seeding, not a mistake
 
 
@@ -223,19 +225,13 @@ def _dtype(fidelity: Fidelity) -> Any:
     return jnp.float64 if fidelity.precision == "f64" else jnp.float32
 
 
-def _whole(ratio: float) -> int | None:
-    """The whole number that a ratio is, or None."""
-    n = round(ratio)
-    return n if n >= 1 and abs(ratio - n) < WHOLE * n else None
-
-
 def _grid(config: SceneConfig, fidelity: Fidelity) -> Grid:
     axes = axes_of(fidelity.dimension)
     dx = config.feature / fidelity.cells
     cells = []
     for a in axes:
         side = config.box.upper[a] - config.box.lower[a]
-        n = _whole(side / dx)
+        n = whole(side / dx)
         if n is None:
             raise ValueError(
                 f"The box is {side:.6g} m along {'xyz'[a]}, which is {side / dx:.4g} cells of {dx:.6g} m: make it a"
@@ -254,7 +250,7 @@ def _wall(config: SceneConfig, side: str) -> Wall:
 def _fitting_cells(config: SceneConfig, fidelity: Fidelity) -> str:
     """Numbers of cells per feature near the one asked for that cut every side of the box into whole cells."""
     sides = [config.box.upper[a] - config.box.lower[a] for a in axes_of(fidelity.dimension)]
-    fits = [n for n in range(2, 200) if all(_whole(s * n / config.feature) for s in sides)]
+    fits = [n for n in range(2, 200) if all(whole(s * n / config.feature) for s in sides)]
     return " or ".join(map(str, sorted(fits, key=lambda n: abs(n - fidelity.cells))[:2])) or "none (change the box)"
 
 
@@ -315,7 +311,7 @@ def _substeps(config: SceneConfig, f: Fidelity, grid: Grid, materials: tuple[Mat
                 f"mpm_dt = {f.mpm_dt:.4g} s exceeds the stable {bound.dt:.4g} s set by {bound.reason} at cell_size"
                 f" {grid.cell_size:.4g} m: use a smaller mpm_dt or fewer cells."
             )
-        n = _whole(f.rigid_dt / f.mpm_dt)
+        n = whole(f.rigid_dt / f.mpm_dt)
         if n is None:
             raise ValueError(
                 f"rigid_dt = {f.rigid_dt:.6g} s is {f.rigid_dt / f.mpm_dt:.4g} substeps of mpm_dt = {f.mpm_dt:.6g} s:"
@@ -338,15 +334,12 @@ def _sizes(bodies: Bodies, grid: Grid, config: SceneConfig, f: Fidelity, slots: 
     crowded = max([CROWDED, *snow])
     dx = grid.cell_size
     slice_at = middle if grid.dimension == 2 else None
-    infinite = any(not np.isfinite(s.size[0]) or s.kind == int(mujoco.mjtGeom.mjGEOM_PLANE) for s in bodies.shapes)
+    infinite = any(not np.isfinite(bounding_radius(s)) for s in bodies.shapes)
     bands = (-NODE_DEPTH * dx, (f.contact_band + MOST_TRAVEL) * dx), (-MOST_TRAVEL * dx, MOST_TRAVEL * dx)
     shell, near = points_near(bodies, bands, dx, middle=slice_at)
     nodes = grid.nodes if infinite else min(grid.nodes, int(ROOM * shell) + 64)
     grains = slots if infinite else min(slots, int(crowded * near * f.particles_per_axis**grid.dimension) + 64)
     return Sizes(nodes, grains if f.push_out else 0)
-
-
-NODE_DEPTH = 2.0  # cells inside a body down to which nodes are looked at: deeper ones carry no grains
 
 
 def _refuse_overlap(scene: Scene) -> None:

@@ -225,7 +225,7 @@ def assets_of(xml: str, folder: Path) -> dict[str, str]:
     compiler = root.find("compiler")
     sub = {k: (compiler.get(k, "") if compiler is not None else "") for k in ("meshdir", "texturedir", "assetdir")}
     out = {}
-    for kind, key in (("mesh", "meshdir"), ("texture", "texturedir"), ("hfield", "assetdir")):
+    for kind, key in (("mesh", "meshdir"), ("texture", "texturedir"), ("hfield", "meshdir")):
         for node in root.iter(kind):
             name = node.get("file")
             file = folder / (sub[key] or sub["assetdir"]) / name if name else None

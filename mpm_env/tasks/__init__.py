@@ -6,8 +6,9 @@ from typing import Any
 
 from mpm_env.config import find, overlay, parse, read_yaml
 from mpm_env.fidelity import Fidelity, load_fidelity
-from mpm_env.scene import WHOLE, build
+from mpm_env.scene import build
 from mpm_env.scene_config import resolve
+from mpm_env.scene_grains import whole
 from mpm_env.tasks.dig import Dig
 from mpm_env.tasks.episode import Episode, reset, step
 from mpm_env.tasks.protocol import Task, TaskConfig, Tool
@@ -40,14 +41,13 @@ def make_task(config: TaskConfig | str, fidelity: Fidelity | str | None = None) 
     fidelity = load_fidelity(fidelity) if isinstance(fidelity, str) else fidelity
     if config.model not in TASKS:
         raise ValueError(f"There is no task model {config.model!r}. Known: {', '.join(TASKS)}.")
-    for what, whole, part in (
+    for what, time, part in (
         ("control_dt", config.control_dt, fidelity.rigid_dt),
         ("time_limit", config.time_limit, config.control_dt),
     ):
-        ratio = whole / part
-        if abs(ratio - round(ratio)) > WHOLE * ratio or round(ratio) < 1:
+        if whole(time / part) is None:
             raise ValueError(
-                f"{what} = {whole:.6g} s is {ratio:.4g} times {part:.6g} s: make it a whole number of times."
+                f"{what} = {time:.6g} s is {time / part:.4g} times {part:.6g} s: make it a whole number of times."
             )
     return TASKS[config.model](config, build(config.scene, fidelity))
 

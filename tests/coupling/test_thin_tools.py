@@ -7,7 +7,7 @@ compiles once with and once without that.
 
 from dataclasses import replace
 from functools import cache, partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,31 +25,31 @@ from mpm_env.scene_config import SceneConfig
 DX = 0.025  # m
 DT = 0.004  # s, a rigid step
 WIDTH = 0.1  # m, of the slice
-LENGTH, DEPTH = 1.2, 0.1  # m, of the bed
+LENGTH, DEPTH = 1.2, 0.2  # m, of the bed
 SAND = {"model": "sand", "E": 1e6, "nu": 0.3, "rho": 1500.0, "friction_deg": 35.0}
 
 BLADES = {0.5: 0.2, 1.0: 0.7}  # thickness in cells: where the blade starts, m, 20 cells from the other one
-OFFSETS = (0.0, 0.5)  # cells, of a blade's middle from a plane of nodes at the start
-HALF_HEIGHT = 0.15  # m; a blade reaches from a cell below the floor to well above any heap
+OFFSETS = (0.0, 0.25)  # cells, of a blade's middle from a plane of nodes at the start
+HALF_HEIGHT = 0.2  # m; a blade reaches from a cell below the floor to well above any heap
 UNDER = DX  # m below the floor
 SPEED = 0.3  # m/s
 STEPS = 125  # 0.15 m of travel: 6 cells
 
-LEAST_LEAK = 0.05  # of the swept mass, through half a cell without push-out
+LEAST_LEAK = 0.05  # of the swept mass, through half a cell without push-out; 0.09 and 0.13 observed
 
 
 @cache
 def bed(push_out: bool) -> Scene:
     """Two blades in the air over a bed."""
     blades = "".join(
-        f"""<body name="blade{i}" mocap="true" pos="{x} {WIDTH / 2} .3">
+        f"""<body name="blade{i}" mocap="true" pos="{x} {WIDTH / 2} {DEPTH + HALF_HEIGHT + DX}">
           <geom name="blade{i}" type="box" size="{thickness * DX / 2} {WIDTH} {HALF_HEIGHT}"/></body>"""
         for i, (thickness, x) in enumerate(BLADES.items())
     )
     config = {
         "name": "blades",
         "plane_strain": True,
-        "box": {"lower": (0, 0, 0), "upper": (LENGTH, WIDTH, 0.4)},
+        "box": {"lower": (0, 0, 0), "upper": (LENGTH, WIDTH, 0.5)},
         "feature": 4 * DX,
         "duration": 1.0,
         "grains": [{"material": SAND, "fill": [{"shape": "box", "lower": (0, 0, 0), "upper": (LENGTH, WIDTH, DEPTH)}]}],
@@ -59,44 +59,41 @@ def bed(push_out: bool) -> Scene:
 
 
 @cache
-def program(push_out: bool):
+def program(push_out: bool) -> Any:
     return jax.jit(partial(sim.advance, bed(push_out)))
 
 
-def planted(scene: Scene, offset: float) -> State:
-    """The start with both blades put into the bed, and the sand that was there taken out."""
+def planted(scene: Scene, at: jax.Array) -> State:
+    """The start with the blades put into the bed at these positions (2, 3) m, and the sand that was there taken out."""
+    assert scene.bodies is not None
     state = initial(scene, jax.random.key(0))
-    at = blades_at(offset, 0.0)
-    x, z = np.asarray(scene.world(state.grains.x))[[0, 2]]
-    in_the_way = np.zeros(x.shape, bool)
-    for thickness, middle in zip(BLADES, at[:, 0], strict=True):
-        in_the_way |= np.abs(x - middle) < thickness * DX / 2
-    assert z.max() < at[0, 2] + HALF_HEIGHT
+    half = jnp.asarray(list(BLADES))[:, None] * DX / 2
+    in_the_way = jnp.any(jnp.abs(scene.world(state.grains.x)[0] - at[:, :1]) < half, axis=0)
     grains = replace(state.grains, m=jnp.where(in_the_way, 0, state.grains.m))
     upright = jnp.tile(jnp.asarray([1.0, 0, 0, 0]), (len(BLADES), 1))
-    d = rigid.refresh(scene.bodies, rigid.place(state.rigid, jnp.asarray(at), upright))
-    return jax.device_put(replace(state, grains=grains, rigid=d), jax.devices()[0])
+    d = rigid.refresh(scene.bodies, rigid.place(state.rigid, at, upright))
+    return replace(state, grains=grains, rigid=d)
 
 
 def blades_at(offset: float, time: float) -> np.ndarray:
     """Positions (2, 3) m of the blades at a time."""
-    return np.asarray([(x + offset * DX + SPEED * time, WIDTH / 2, HALF_HEIGHT - UNDER) for x in BLADES.values()])
+    at = [(x + offset * DX + SPEED * time, WIDTH / 2, HALF_HEIGHT - UNDER) for x in BLADES.values()]
+    return np.asarray(at, np.float32)
 
 
 class Drag(NamedTuple):
     """What one drag through the bed did; rows are blades."""
 
     leaked: np.ndarray  # (2,) of the mass that the blade swept
-    over: int  # grains as high as a blade's top, ever seen at the end
-    carried: np.ndarray  # (2,) of the swept mass, that is still in front
+    over: int  # grains at the end that are within a cell of a blade's top, or higher
     health: int
 
 
 @cache
 def drag(push_out: bool, offset: float) -> Drag:
     scene = bed(push_out)
-    start = planted(scene, offset)
-    positions = np.asarray([blades_at(offset, (k + 1) * DT) for k in range(STEPS)], np.float32)
+    start = jax.jit(partial(planted, scene))(blades_at(offset, 0.0))
+    positions = np.asarray([blades_at(offset, (k + 1) * DT) for k in range(STEPS)])
     turns = np.tile(np.asarray([1, 0, 0, 0], np.float32), (STEPS, len(BLADES), 1))
     drives = sim.Drive(jnp.zeros((STEPS, 0)), jnp.asarray(positions), jnp.asarray(turns))
     end, _ = program(push_out)(start, drives)
@@ -106,11 +103,9 @@ def drag(push_out: bool, offset: float) -> Drag:
     ahead = x0 > first[:, None]
     swept = ahead & (x0 < last[:, None])
     behind = x1 < last[:, None]
-    mass = swept @ m
     return Drag(
-        leaked=(ahead & behind) @ m / mass,
+        leaked=(ahead & behind) @ m / (swept @ m),
         over=int(np.sum((m > 0) & (z1 > 2 * HALF_HEIGHT - UNDER - DX))),
-        carried=(swept & ~behind) @ m / mass,
         health=int(end.health),
     )
 
@@ -119,7 +114,6 @@ def drag(push_out: bool, offset: float) -> Drag:
 @pytest.mark.parametrize("blade", range(len(BLADES)), ids=[f"{t}-cells" for t in BLADES])
 def test_no_sand_passes_through_a_thin_blade(blade: int, offset: float) -> None:
     done = drag(True, offset)
-    print(done, drag(False, offset))
     assert done.over == 0, "sand went over the top"
     assert done.leaked[blade] == 0
     assert done.health == Health.WELL

@@ -3,12 +3,15 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from mpm_env import cli
 from mpm_env.config import known
+from mpm_env.log import read
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 TINY = """
@@ -100,21 +103,61 @@ def test_run_prints_what_it_came_to(tiny: Path, capsys: pytest.CaptureFixture[st
 
 def test_replay_says_identical_and_ends_with_status_0(ran: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["replay", str(ran / "run.rrd")]) == 0
-    assert "identical: the largest difference over 4 frames is 0 m" in capsys.readouterr().out
+    assert "identical: grains and bodies are the same to the bit over 4 frames" in capsys.readouterr().out
 
 
 def test_replay_that_differs_says_where_and_ends_with_status_1(
     ran: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     import mpm_env.replay
-    from mpm_env.replay import Comparison
+    from mpm_env.replay import Comparison, Difference
 
-    found = Comparison(4, 0.003, 20, 0.08, (0.1, 0.0, 0.2), {"jax": ("0.1", "0.2")})
+    grains = Difference(0.003, 20, 0.08, "the grain at (0.1, 0, 0.2) m")
+    found = Comparison(4, grains, Difference(0.0, 0, 0.0, ""), {"jax": ("0.1", "0.2")})
     monkeypatch.setattr(mpm_env.replay, "compare", lambda *args, **kwargs: found)
     assert cli.main(["replay", str(ran / "run.rrd")]) == cli.DIFFERS
     said = capsys.readouterr().out
     assert "jax was 0.1 when recorded and is 0.2 now" in said
-    assert "0.003 m, of the grain at (0.1, 0, 0.2) m at 0.08 s (step 20)" in said
+    assert (
+        "grains: the largest difference is 0.003 m, that of the grain at (0.1, 0, 0.2) m, at 0.08 s (step 20)" in said
+    )
+    assert "bodies: the largest difference is 0" in said
+
+
+def test_view_only_opens_the_viewer(ran: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened = []
+    monkeypatch.setattr("mpm_env.log.open_viewer", opened.append)
+    monkeypatch.setattr("mpm_env.replay.compare", lambda *args, **kwargs: pytest.fail("it simulated"))
+    assert cli.main(["replay", str(ran / "run.rrd"), "--view"]) == 0
+    assert opened == [str(ran / "run.rrd")]
+
+
+def test_recording_whose_recipe_lacks_something_is_refused(
+    ran: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recording = replace(read(ran / "run.rrd"), recipe={"kind": "scene", "fidelity": None})
+    monkeypatch.setattr("mpm_env.log.read", lambda path: recording)
+    with pytest.raises(SystemExit) as end:
+        cli.main(["replay", "any.rrd"])
+    said = capsys.readouterr().err
+    assert end.value.code == cli.REFUSED and "recipe lacks 'steps_per_frame'" in said and said.count("\n") == 1
+
+
+def test_demo_goes_to_demo_out_in_the_precision_of_its_fidelity(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked: list[Any] = []
+
+    def prepare(task: Any, fidelity: Any, out: Any, *, seed: int) -> None:
+        asked.extend([task.scene.name, fidelity.precision, out, seed])
+        raise ValueError("enough seen.")
+
+    (tmp_path / "exact.yaml").write_text("precision: f64")
+    monkeypatch.setattr("mpm_env.demo.prepare", prepare)
+    monkeypatch.setattr(cli, "use_precision", asked.append)
+    with pytest.raises(SystemExit):
+        cli.main(["demo", "push", "--fidelity", str(tmp_path / "exact.yaml")])
+    assert asked == ["f64", "push_sand", "f64", "demo_out", 0]
 
 
 def test_replay_of_no_recording_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

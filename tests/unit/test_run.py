@@ -10,56 +10,24 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import pytest
 
 from mpm_env import log
+from mpm_env.cli import report
 from mpm_env.config import parse
 from mpm_env.fidelity import Fidelity
 from mpm_env.ledger import Ledger
 from mpm_env.replay import compare
 from mpm_env.run import FILES, prepare, rhythm_of, run, versions
-from mpm_env.scene import Scene, build, initial
+from mpm_env.scene import build
 from mpm_env.scene_config import BodiesConfig, SceneConfig
-from mpm_env.view import View, body_data, camera_of
+from mpm_env.view import camera_of
+from tests.unit.slices import F32, NUMERICS, SPEED, slice_of_sand
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-SAND = {"model": "sand", "E": 1e5, "nu": 0.3, "rho": 1600.0, "friction_deg": 35.0}
-MODEL = """
-<mujoco>
-  <worldbody>
-    <body name="hand" mocap="true" pos=".08 .1 .09"><geom name="paddle" type="box" size=".02 .1 .06"/></body>
-    <geom name="kerb" type="box" pos=".36 .1 .01" size=".02 .1 .02"/>
-  </worldbody>
-</mujoco>
-"""
-SPEED = 0.5  # m/s of the paddle
-NUMERICS = Fidelity(cells=3, rigid_dt=0.004)
 STEPS_PER_FRAME = 10  # at 25 frames per second
-F32 = 1e-5  # share that sums over some hundred numbers of f32 may be off
-
-
-def slice_of_sand(bodies: bool, **changed: Any) -> SceneConfig:
-    """Sand in a slice 0.4 m long, 0.2 m thick; with bodies, a paddle moves through it towards a kerb."""
-    data: dict[str, Any] = {
-        "name": "slice",
-        "plane_strain": True,
-        "box": {"lower": [0.0, 0.0, 0.0], "upper": [0.4, 0.2, 0.2]},
-        "feature": 0.1,
-        "duration": 0.2,
-        "walls": {"z_lower": {"kind": "separate", "friction": 0.5}},
-        "grains": [
-            {"material": SAND, "fill": [{"shape": "box", "lower": [0.13, 0.0, 0.0], "upper": [0.33, 0.2, 0.1]}]}
-        ],
-        **changed,
-    }
-    if bodies:
-        path = [{"t": t, "position": [0.08 + SPEED * t, 0.1, 0.09]} for t in (0.0, 0.2)]
-        data["bodies"] = {"mjcf": MODEL, "couple": ["paddle", "kerb"], "motion": {"hand": path}}
-    return parse(SceneConfig, data, "slice")
 
 
 @pytest.fixture(scope="module")
@@ -117,6 +85,7 @@ def test_time_series_have_the_promised_names_and_shapes(pushed: tuple[Path, dict
         "snapshot_x": (4, slots, 3),
         "snapshot_v": (4, slots, 3),
         "snapshot_mass": (4, slots),
+        "snapshot_history": (4, 1, slots),
         "snapshot_material": (slots,),
     }
     assert {k: v.shape for k, v in series.items()} == expected
@@ -147,7 +116,8 @@ def test_recording_holds_the_run_and_its_recipe(pushed: tuple[Path, dict[str, An
 
 def test_replay_of_a_run_gives_the_same_bits(pushed: tuple[Path, dict[str, Any]]) -> None:
     found = compare(log.read(pushed[0] / "run.rrd"), progress=False)
-    assert found.identical and found.largest == 0 and found.frames == 6 and found.versions == {}
+    assert found.identical and found.frames == 6 and found.versions == {}
+    assert found.grains.size == found.bodies.size == 0
 
 
 def test_replay_finds_the_grain_that_differs(pushed: tuple[Path, dict[str, Any]]) -> None:
@@ -157,8 +127,10 @@ def test_replay_finds_the_grain_that_differs(pushed: tuple[Path, dict[str, Any]]
     recipe = {**recording.recipe, "versions": {**recording.recipe["versions"], "jax": "0.0"}}
     found = compare(replace(recording, grains=grains, recipe=recipe), progress=False)
     assert not found.identical
-    assert found.largest == pytest.approx(0.01 * np.sqrt(3), rel=1e-3)
-    assert (found.step, found.at) == (20, tuple(map(float, grains[2][7])))
+    assert found.grains.size == pytest.approx(0.01 * np.sqrt(3), rel=1e-3)
+    x, y, z = grains[2][7]
+    assert (found.grains.step, found.grains.where) == (20, f"the grain at ({x:.4g}, {y:.4g}, {z:.4g}) m")
+    assert found.bodies.size == 0
     assert found.versions == {"jax": ("0.0", versions()["jax"])}
 
 
@@ -168,6 +140,58 @@ def test_replay_refuses_what_it_cannot_simulate(pushed: tuple[Path, dict[str, An
         compare(replace(recording, recipe={"kind": "other"}))
     with pytest.raises(ValueError, match="holds no frame"):
         compare(replace(recording, steps=recording.steps[:0]))
+
+
+@pytest.mark.parametrize(
+    ("recipe", "words"),
+    [
+        ({"kind": "scene"}, "recipe lacks 'steps_per_frame': it cannot be simulated again."),
+        ({"kind": "scene", "steps_per_frame": 1, "seed": 0}, "recipe lacks 'config'"),
+        ({"kind": "scene", "steps_per_frame": 1, "seed": "x"}, "recipe has 'seed' = 'x'"),
+        ({"kind": "task"}, "recipe lacks 'key'"),
+        ({"kind": "task", "key": 1, "config": []}, "recipe has 'config' = []"),
+    ],
+)
+def test_recipe_that_lacks_something_is_one_sentence(
+    pushed: tuple[Path, dict[str, Any]], recipe: dict[str, Any], words: str
+) -> None:
+    with pytest.raises(ValueError) as refusal:
+        compare(replace(log.read(pushed[0] / "run.rrd"), recipe=recipe), progress=False)
+    assert words in str(refusal.value)
+
+
+@pytest.fixture(scope="module")
+def falling(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    """A ball that falls where no grain is."""
+    out = tmp_path_factory.mktemp("falling")
+    mjcf = '<mujoco><worldbody><body name="b" pos=".2 .1 .15"><freejoint/><geom name="ball" size=".02"/></body>'
+    ball = BodiesConfig(mjcf=mjcf + "</worldbody></mujoco>", couple=["ball"])
+    config = slice_of_sand(bodies=False, grains=[], duration=0.08).model_copy(update={"bodies": ball})
+    return out, run(config, NUMERICS, out, progress=False)
+
+
+def test_replay_without_grains_compares_the_bodies(falling: tuple[Path, dict[str, Any]]) -> None:
+    recording = log.read(falling[0] / "run.rrd")
+    assert recording.poses[-1][0, 2] < recording.poses[0][0, 2] - 0.01  # it falls
+    assert compare(recording, progress=False).identical
+    poses = [x.copy() for x in recording.poses]
+    poses[1][0, 2] = np.nextafter(poses[1][0, 2], 1)  # one bit
+    found = compare(replace(recording, poses=poses), progress=False)
+    assert not found.identical and found.grains.size == 0
+    assert 0 < found.bodies.size < 1e-15
+    assert (found.bodies.step, found.bodies.where) == (10, "the geom 'ball'")
+
+
+def test_replay_of_another_number_of_geoms_differs(falling: tuple[Path, dict[str, Any]]) -> None:
+    recording = log.read(falling[0] / "run.rrd")
+    found = compare(replace(recording, poses=[np.zeros((0, 12)) for _ in recording.poses]), progress=False)
+    assert not found.identical and found.bodies.size == np.inf
+
+
+def test_scene_without_grains_has_no_top_of_grains(falling: tuple[Path, dict[str, Any]]) -> None:
+    assert falling[1]["figures"]["top_of_grains_m"] is None
+    said = "\n".join(report(falling[1]))
+    assert "top" not in said and "inf" not in said and "mass" not in said
 
 
 # Runs without bodies compile in a second.
@@ -254,14 +278,34 @@ def test_run_that_cannot_be_is_refused_and_leaves_nothing(tmp_path: Path, asked:
     assert not (tmp_path / "out").exists()
 
 
-def test_recording_that_cannot_be_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("refused", ["environment", "recorder"])
+def test_recording_that_is_refused_leaves_what_was_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refused: str
+) -> None:
     def refuses(*args: Any, **kwargs: Any) -> None:
-        raise ValueError("not today.")
+        raise ValueError("RERUN=off, or so.")
 
-    monkeypatch.setattr("mpm_env.run.Recorder", refuses)
-    with pytest.raises(ValueError, match="not today"):
-        prepare(slice_of_sand(bodies=False), NUMERICS, tmp_path / "out")
-    assert not (tmp_path / "out").exists()
+    if refused == "environment":
+        monkeypatch.setenv("RERUN", "off")
+    else:
+        monkeypatch.setattr("mpm_env.run.Recorder", refuses)
+    earlier = tmp_path / "earlier"
+    earlier.mkdir()
+    for name in FILES:
+        (earlier / name).write_text(name)
+    for out in (earlier, tmp_path / "new" / "out"):
+        with pytest.raises(ValueError, match="RERUN=off"):
+            prepare(slice_of_sand(bodies=False), NUMERICS, out)
+    assert {p.name: p.read_text() for p in earlier.iterdir()} == {name: name for name in FILES}
+    assert not (tmp_path / "new").exists()
+
+
+def test_file_name_taken_by_a_folder_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "run.npz").mkdir()
+    (tmp_path / "run.png").write_text("earlier")
+    with pytest.raises(ValueError, match=r"run\.npz is a folder, and a file is to go there"):
+        prepare(slice_of_sand(bodies=False), NUMERICS, tmp_path)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["run.npz", "run.png"]
 
 
 def test_folder_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
@@ -280,69 +324,3 @@ def test_rhythm_counts_in_whole_numbers() -> None:
     built = build(slice_of_sand(bodies=False), NUMERICS)
     assert rhythm_of(built, 25) == (10, 5, None)
     assert rhythm_of(built, 125, 25) == (2, 25, 5)
-
-
-# The ledger against closed forms.
-
-
-def thrown(dimension: int) -> tuple[Scene, Any]:
-    """A block of sand thrown and turning, off the world's origin, before any step."""
-    fill = {"shape": "box", "lower": [0.1, 0.05, 0.05], "upper": [0.2, 0.15, 0.15], "velocity": [0.3, 0.0, -0.2]}
-    config = slice_of_sand(bodies=False, plane_strain=dimension == 2, grains=[{"material": SAND, "fill": [fill]}])
-    config = config.model_copy(update={"box": config.box.model_copy(update={"lower": (-0.2, 0.0, -0.1)})})
-    built = build(config, Fidelity(cells=4, dimension=dimension))
-    state = initial(built, jax.random.key(0))
-    spin = 5.0  # rad/s about +y
-    x, z = state.grains.x[0] + built.grid.origin[0], state.grains.x[-1] + built.grid.origin[-1]
-    there = state.grains.m > 0
-    v = state.grains.v.at[0].add(jnp.where(there, spin * z, 0)).at[-1].add(jnp.where(there, -spin * x, 0))
-    C = state.grains.C.at[0, -1].set(spin).at[-1, 0].set(-spin)
-    return built, replace(state, grains=replace(state.grains, v=v, C=jnp.where(there, C, 0)))
-
-
-@pytest.mark.parametrize("dimension", [2, 3])
-def test_ledger_of_grains_agrees_with_sums_over_space(dimension: int) -> None:
-    built, state = thrown(dimension)
-    ledger = Ledger(built)
-    view = View.of(built, state)
-    ledger.note(state, view, np.zeros((1, 0, 6)))
-    row = {k: v[0] for k, v in ledger.frames.items()}
-    m = np.asarray(state.grains.m, float)[view.slots, None]
-    v = np.zeros((len(m), 3))
-    v[:, [0, 2] if dimension == 2 else [0, 1, 2]] = np.asarray(state.grains.v, float).T[view.slots]
-    x = view.grains.astype(float)
-    inertia = float(m.sum()) * built.grid.cell_size**2 / 4  # of the affine part, per axis
-    assert row["mass"] == pytest.approx(1600 * 0.1 * 0.1 * 0.1, rel=F32)
-    assert row["momentum"] == pytest.approx((m * v).sum(0), abs=F32)
-    turning = (m * np.cross(x, v)).sum(0) + np.array([0, 2 * 5.0 * inertia, 0])
-    assert row["angular_momentum"] == pytest.approx(turning, abs=F32)
-    assert row["kinetic"] == pytest.approx(0.5 * (m * v**2).sum() + 0.5 * 2 * 25.0 * inertia, rel=F32)
-    assert row["potential"] == pytest.approx(9.81 * (m[:, 0] * x[:, 2]).sum(), rel=F32)
-    assert row["elastic"] == pytest.approx(0, abs=1e-9)
-
-
-def test_ledger_of_bodies_agrees_with_a_rigid_body() -> None:
-    mjcf = '<mujoco><worldbody><body name="b" pos=".2 .1 .15"><freejoint/><geom name="g" type="box" size=".04 .03 .02"'
-    mjcf += ' mass="2"/></body></worldbody></mujoco>'
-    coupled = BodiesConfig(mjcf=mjcf, couple=["g"])
-    built = build(slice_of_sand(bodies=False, grains=[]).model_copy(update={"bodies": coupled}), NUMERICS)
-    state = initial(built, jax.random.key(0))
-    v, w = np.array([0.1, -0.2, 0.3]), np.array([1.0, 2.0, -3.0])
-    state = replace(state, rigid=state.rigid.replace(qvel=jnp.asarray([*v, *w])))
-    ledger = Ledger(built)
-    ledger.note(state, View.of(built, state), np.zeros((1, 1, 6)))
-    row = {k: v[0] for k, v in ledger.frames.items()}
-    inertia = 2 / 3 * np.array([0.03**2 + 0.02**2, 0.04**2 + 0.02**2, 0.04**2 + 0.03**2])
-    assert row["bodies_momentum"] == pytest.approx(2 * v, rel=F32)
-    assert row["bodies_angular_momentum"] == pytest.approx(np.cross([0.2, 0.1, 0.15], 2 * v) + inertia * w, rel=F32)
-    assert row["bodies_kinetic"] == pytest.approx(v @ v + 0.5 * (inertia * w) @ w, rel=F32)
-    assert row["bodies_potential"] == pytest.approx(2 * 9.81 * 0.15, rel=F32)
-    assert row["body_twist"][1] == pytest.approx([*v, *w], rel=F32)
-
-
-def test_view_of_bodies_has_their_poses() -> None:
-    built = build(slice_of_sand(bodies=True), NUMERICS)
-    data = body_data(built, initial(built, jax.random.key(0)))
-    assert isinstance(data, mujoco.MjData) and built.bodies is not None
-    assert data.body("hand").xpos == pytest.approx([0.08, 0.1, 0.09])
-    assert body_data(build(slice_of_sand(bodies=False), NUMERICS), None) is None  # type: ignore[arg-type]

@@ -204,3 +204,15 @@ def test_every_shipped_scene_builds_at_every_fidelity(name: str, fidelity: str) 
     assert built.slots > 0
     assert round(1 / (25 * built.rigid_dt), 6).is_integer()  # frames at 25 per second, the command line's default
     assert round(built.config.duration * 25, 6).is_integer()
+
+
+def test_controls_beyond_the_actuator_s_range_are_refused() -> None:
+    settings = ("bodies.controls.boom=[[0.0, 5.0]]",)
+    with pytest.raises(ValueError, match=r"The controls of 'boom' go from 5 to 5, beyond its range of -0\.35 to 1\.4"):
+        build(read_scene("bucket_dig", settings), load_fidelity("draft"))
+
+
+def test_friction_on_a_wall_that_does_not_rub_is_refused() -> None:
+    settings = ("walls.x_lower={kind: slip, friction: 0.3}",)
+    with pytest.raises(ValueError, match="a wall of kind 'slip' has no friction"):
+        read_scene("column_collapse_2d", settings)
