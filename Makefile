@@ -1,5 +1,5 @@
 # The two commands: `make demo` runs the main job, `make test` passes the tests. Both set everything up first.
-# Needed: Python 3.11 to 3.14 with venv and pip, make, git. Another interpreter: `make test PYTHON=/path/to/python3.12`
+# Needed: Python 3.11 to 3.13 with venv and pip, make, git. Another interpreter: `make test PYTHON=/path/to/python3.12`
 # (it matters only while there is no .venv yet).
 
 PYTHON ?= python3
@@ -9,8 +9,8 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.mpm-env-ready
 
 # A PYTHON that someone named is taken at its word; otherwise the first of these that will do.
-CANDIDATES := $(if $(filter file default undefined,$(origin PYTHON)),$(PYTHON) python3.13 python3.12 python3.11 python3.14,$(PYTHON))
-RIGHT_VERSION := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 14))
+CANDIDATES := $(if $(filter file default undefined,$(origin PYTHON)),$(PYTHON) python3.13 python3.12 python3.11,$(PYTHON))
+RIGHT_VERSION := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))
 WILL_DO := import ensurepip, venv; $(RIGHT_VERSION)
 
 .DEFAULT_GOAL := help
@@ -57,14 +57,14 @@ $(READY): pyproject.toml constraints.txt
 			if "$$python" -c '$(WILL_DO)' 2>/dev/null; then found="$$python"; break; fi; \
 		done; \
 		if [ -z "$$found" ]; then \
-			echo "mpm-env needs Python 3.11 to 3.14 with venv and pip, and none of these is one: $(CANDIDATES);" \
+			echo "mpm-env needs Python 3.11 to 3.13 with venv and pip, and none of these is one: $(CANDIDATES);" \
 				"install one or name it: make PYTHON=/path/to/python3.12" >&2; \
 			exit 1; \
 		fi; \
 		echo "making $(VENV) with $$("$$found" --version)"; \
 		"$$found" -m venv --clear $(VENV); \
 	elif ! $(BIN)/python -c '$(RIGHT_VERSION)'; then \
-		echo "$(VENV) holds $$($(BIN)/python --version), and mpm-env needs Python 3.11 to 3.14:" \
+		echo "$(VENV) holds $$($(BIN)/python --version), and mpm-env needs Python 3.11 to 3.13:" \
 			"remove $(VENV) and run make again" >&2; \
 		exit 1; \
 	fi

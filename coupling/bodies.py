@@ -7,6 +7,8 @@ bodies that move with the joint velocities of the exchange.
 
 from __future__ import annotations
 
+import contextlib
+import io
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
@@ -16,7 +18,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jax import Array
-from mujoco import mjx
+
+with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+    from mujoco import mjx  # prints that it lacks a package which nothing here uses
 from mujoco.mjx._src.types import IntegratorType
 
 from coupling.contact import distances
@@ -108,11 +112,10 @@ def _jointed(model: mujoco.MjModel, body: int) -> bool:
     return bool(model.body_treeid[body] >= 0)
 
 
-def start(b: Bodies, qpos: Array | None, ctrl: Array, mocap: tuple[Array, Array]) -> Any:
-    """MJX data at rest at qpos (nq,), or at the model's own pose, with controls and mocap poses set."""
+def start(b: Bodies, qpos: Array, qvel: Array, ctrl: Array, mocap: tuple[Array, Array]) -> Any:
+    """MJX data at qpos (nq,) with joint velocities qvel (nv,), controls ctrl (nu,) and mocap poses set."""
     d = mjx.make_data(b.mjx_model)
-    if qpos is not None:
-        d = d.replace(qpos=jnp.asarray(qpos, d.qpos.dtype))
+    d = d.replace(qpos=jnp.asarray(qpos, d.qpos.dtype), qvel=jnp.asarray(qvel, d.qvel.dtype))
     d = d.replace(ctrl=jnp.asarray(ctrl, d.ctrl.dtype))
     return refresh(b, place(d, *mocap))
 

@@ -121,7 +121,9 @@ def _plain(value: Any) -> Any:
 
 
 def _sentence(schema: type[BaseModel], error: ValidationError) -> str:
-    fault = error.errors(include_url=False)[0]
+    faults = error.errors(include_url=False)
+    # A misspelt key that is required is two faults, missing and unknown: the unknown one has the hint.
+    fault = next((f for f in faults if f["type"] == "extra_forbidden"), faults[0])
     steps, beside = _walk(schema, fault["loc"])
     place = ".".join(steps)
     if fault["type"] == "extra_forbidden":

@@ -32,7 +32,7 @@ SENTENCES: dict[Health, str] = {
     Health.NODES_OVERFLOW: "More grid nodes are near bodies than were set aside: contact is incomplete.",
     Health.GRAINS_OVERFLOW: "More grains are near bodies than were set aside: contact is incomplete.",
     Health.NOT_CONVERGED: "Contact between grains and bodies was not solved: raise contact_iterations.",
-    Health.BODY_TOO_FAST: "A coupled body moved over a quarter of a cell in one rigid step: use a smaller rigid_dt.",
+    Health.BODY_TOO_FAST: "A body moved over a quarter of a cell in one rigid step: use a smaller fidelity.rigid_dt.",
 }
 
 

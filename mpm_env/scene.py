@@ -157,7 +157,7 @@ def build(config: SceneConfig, fidelity: Fidelity) -> Scene:
 
 
 def initial(scene: Scene, key: Array, *, qpos: Array | None = None) -> State:
-    """The start of a run: grains scattered by the key, bodies at their keyframe or at qpos (nq,)."""
+    """The start of a run: grains scattered by the key, bodies at their keyframe, or at qpos (nq,) instead."""
     g = scene.grid
     d = g.dimension
     rows: dict[str, list[Array]] = {"x": [], "v": [], "m": [], "V0": []}
@@ -198,10 +198,12 @@ def initial(scene: Scene, key: Array, *, qpos: Array | None = None) -> State:
     )
     rigid = None
     if scene.bodies is not None:
-        at = qpos if qpos is not None else _keyframe_qpos(scene)
+        at, speed = _keyframe(scene)
         position, turn = scene.motion.mocap(0.0)
         control = jnp.asarray(scene.motion.control(0.0))
-        rigid = start(scene.bodies, at, control, (jnp.asarray(position), jnp.asarray(turn)))
+        rigid = start(
+            scene.bodies, at if qpos is None else qpos, speed, control, (jnp.asarray(position), jnp.asarray(turn))
+        )
     geoms = len(scene.bodies.geoms) if scene.bodies else 0
     state = State(
         rigid=rigid,
@@ -217,7 +219,7 @@ def initial(scene: Scene, key: Array, *, qpos: Array | None = None) -> State:
 
 
 def _dtype(fidelity: Fidelity) -> Any:
-    if fidelity.precision == "f64" and not jax.config.jax_enable_x64:
+    if fidelity.precision == "f64" and jax.dtypes.canonicalize_dtype(np.float64) != np.float64:
         raise ValueError(
             'precision = f64 needs 64-bit JAX, which is off: call jax.config.update("jax_enable_x64", True)'
             " before building, or choose f32."
@@ -280,15 +282,16 @@ def _coupled(bodies: BodiesConfig, model: mujoco.MjModel) -> dict[int, float]:
     return out
 
 
-def _keyframe_qpos(scene: Scene) -> Array | None:
+def _keyframe(scene: Scene) -> tuple[Array, Array]:
+    """Joint positions (nq,) and velocities (nv,) at the start: the named keyframe's, or the model's pose at rest."""
     assert scene.bodies is not None and scene.config.bodies is not None
     model, name = scene.bodies.model, scene.config.bodies.keyframe
     if name is None:
-        return None
+        return jnp.asarray(model.qpos0), jnp.zeros((model.nv,))
     known = [model.key(i).name for i in range(model.nkey)]
     if name not in known:
         raise ValueError(f"The model has no keyframe {name!r}{nearest(name, known)}")
-    return jnp.asarray(model.key(name).qpos)
+    return jnp.asarray(model.key(name).qpos), jnp.asarray(model.key(name).qvel)
 
 
 def _substeps(config: SceneConfig, f: Fidelity, grid: Grid, materials: tuple[Material, ...], motion: Motion) -> int:

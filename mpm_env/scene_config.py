@@ -141,12 +141,14 @@ class Waypoint(Section):
 class BodiesConfig(Section):
     """A MuJoCo model and what of it meets the grains."""
 
-    mjcf: str  # the MJCF text itself; in a file, the name of an .xml beside it, or package:NAME
+    # The MJCF text itself, whose timestep gives way to the fidelity's rigid_dt. In a file: the name of an .xml beside
+    # it, or package:NAME.
+    mjcf: str
     assets: dict[str, str] = {}  # mesh and texture files the model needs, base64; filled when a file is read
     couple: Annotated[list[str], Field(min_length=1)]  # names or patterns of the coupled geoms
     friction: NotNegative = 0.4  # between coupled geoms and grains
     friction_of: dict[str, NotNegative] = {}  # pattern -> friction, where it differs
-    keyframe: str | None = None  # where the model starts
+    keyframe: str | None = None  # joint positions and velocities at the start
     controls: dict[str, list[tuple[NotNegative, float]]] = {}  # actuator -> (t, value), joined by a monotone cubic
     motion: dict[str, Annotated[list[Waypoint], Field(min_length=1)]] = {}  # mocap body -> waypoints
 

@@ -46,7 +46,7 @@ def scripted(scene: Scene, first: int, count: int) -> Drive:
         position, turn = scene.motion.mocap((k + 1) * scene.rigid_dt)
         positions.append(position)
         turns.append(turn)
-    dtype = np.float64 if jax.config.jax_enable_x64 else np.float32
+    dtype = jax.dtypes.canonicalize_dtype(np.float64)
     return Drive(*(jnp.asarray(np.asarray(rows), dtype) for rows in (controls, positions, turns)))
 
 

@@ -216,3 +216,26 @@ def test_friction_on_a_wall_that_does_not_rub_is_refused() -> None:
     settings = ("walls.x_lower={kind: slip, friction: 0.3}",)
     with pytest.raises(ValueError, match="a wall of kind 'slip' has no friction"):
         read_scene("column_collapse_2d", settings)
+
+
+def test_a_keyframe_gives_bodies_their_velocity() -> None:
+    ball = """<mujoco><worldbody><body name="ball" pos="0.2 0 0.3"><freejoint/><geom name="ball" size="0.03"/></body>
+    </worldbody><keyframe><key name="thrown" qpos="0.2 0 0.3 1 0 0 0" qvel="1.5 0 0 0 0 0"/></keyframe></mujoco>"""
+    config = parse(
+        SceneConfig,
+        {
+            "name": "throw",
+            "box": {"lower": [0, -0.2, 0], "upper": [0.8, 0.2, 0.4]},
+            "feature": 0.1,
+            "duration": 1.0,
+            "bodies": {"mjcf": ball, "couple": ["ball"], "keyframe": "thrown"},
+        },
+        "throw",
+    )
+    state = initial(build(config, Fidelity()), jax.random.key(0))
+    np.testing.assert_allclose(state.rigid.qvel, [1.5, 0, 0, 0, 0, 0])
+
+
+def test_a_misspelt_required_key_gets_the_hint() -> None:
+    with pytest.raises(ValueError, match="unknown key 'featur': did you mean 'feature'"):
+        parse(SceneConfig, {"name": "x", "box": {}, "featur": 0.1, "duration": 1.0}, "x")
