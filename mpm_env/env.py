@@ -27,7 +27,7 @@ def spaces(task: Task) -> tuple[gym.spaces.Dict, gym.spaces.Box]:
     observation = gym.spaces.Dict(
         {k: gym.spaces.Box(-LARGEST, LARGEST, v.shape, np.float32) for k, v in sorted(shapes.items())}
     )
-    return observation, gym.spaces.Box(-1.0, 1.0, (task.action_size,), np.float32)
+    return observation, gym.spaces.Box(-1.0, 1.0, task.rates.shape, np.float32)
 
 
 def checked(action: Any, space: gym.spaces.Box) -> np.ndarray:

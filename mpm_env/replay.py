@@ -75,10 +75,10 @@ def task_frames(recording: Recording) -> Frames:
         parse(Fidelity, entry("fidelity", dict), "the recorded fidelity"),
     )
     count = len(recording.steps) - 1
-    if recording.actions.shape != (len(recording.actions), task.action_size) or len(recording.actions) < count:
+    if recording.actions.shape != (len(recording.actions), task.rates.size) or len(recording.actions) < count:
         raise ValueError(
             f"The recording has actions {recording.actions.shape} for {count} frames after the first: it needs"
-            f" ({count}, {task.action_size})."
+            f" ({count}, {task.rates.size})."
         )
     episode = jax.jit(partial(reset, task))(jax.random.key(key))
     act = jax.jit(partial(step, task))

@@ -27,7 +27,7 @@ from mpm_env.mpm.materials import Material
 from mpm_env.mpm.stability import courant_limit, largest_dt
 from mpm_env.mpm.substep import Bed
 from mpm_env.mpm.transfer import CHUNK
-from mpm_env.mpm.types import MARGIN, Grid, Particles, Wall
+from mpm_env.mpm.types import Grid, Particles, Wall
 from mpm_env.scene_config import BodiesConfig, SceneConfig, Vec3
 from mpm_env.scene_grains import WHOLE, axes_of, fill_of, material_of, whole
 
@@ -374,4 +374,4 @@ def inside_grid(grid: Grid, x: Array) -> Array:
     return jnp.all((s >= 0.5) & (s < last), axis=0)
 
 
-__all__ = ["MARGIN", "WHOLE", "Scene", "State", "build", "initial", "inside_grid", "lift"]
+__all__ = ["WHOLE", "Scene", "State", "build", "initial", "inside_grid", "lift"]

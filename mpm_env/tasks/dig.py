@@ -68,11 +68,6 @@ class Dig:
     }
     rates: ClassVar[np.ndarray] = RATES
 
-    @property
-    def action_size(self) -> int:
-        """Three joints."""
-        return 3
-
     @cached_property
     def _ids(self) -> tuple[int, int]:
         assert self.scene.bodies is not None

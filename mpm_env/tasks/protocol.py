@@ -36,7 +36,7 @@ class Task(Protocol):
     """A task over one scene. Pure: everything that changes is in the state."""
 
     term_weights: ClassVar[dict[str, float]]  # reward = sum of weight times term; weights sum to 1
-    rates: ClassVar[np.ndarray]  # (a,) change of the actuator targets per second at full action
+    rates: ClassVar[np.ndarray]  # (a,) change of the actuator targets per second at full action, whose elements are +-1
 
     @property
     def config(self) -> TaskConfig:
@@ -45,10 +45,6 @@ class Task(Protocol):
     @property
     def scene(self) -> Scene:
         """What is simulated, and how finely."""
-
-    @property
-    def action_size(self) -> int:
-        """Length of an action; each element is in [-1, 1]."""
 
     def initial(self, key: Array) -> State:
         """A seeded start."""

@@ -54,11 +54,6 @@ class Push:
     }
     rates: ClassVar[np.ndarray] = RATES
 
-    @property
-    def action_size(self) -> int:
-        """Two slides and a yaw."""
-        return 3
-
     @cached_property
     def _ids(self) -> tuple[int, int]:
         assert self.scene.bodies is not None
