@@ -121,12 +121,10 @@ class Contact(NamedTuple):
 
     scene: Scene
     stance: Stance
-    nodes_near: Array  # (K,) indices into the flattened grid
-    nodes_used: Array  # (K,) bool
+    watched: Array  # (K,) indices into the flattened grid, its size where a slot is free
     nodes_x: Array  # (K, 3) m
     nodes_over: Array  # () bool, more than fit
-    grains_near: Array  # (P,) indices of grains
-    grains_used: Array  # (P,) bool
+    grains_near: Array  # (P,) indices of grains, their number where a slot is free
     grains_over: Array  # () bool
 
     @classmethod
@@ -141,14 +139,14 @@ class Contact(NamedTuple):
         )
         phi = distances(b.shapes, nodes, pos, mat)[0]
         band = (scene.fidelity.contact_band + MOST_TRAVEL) * dx
-        near, used, over = _pick((phi < band) & (phi > -NODE_DEPTH * dx), scene.sizes.nodes)
+        near, over = _pick((phi < band) & (phi > -NODE_DEPTH * dx), scene.sizes.nodes)
         if scene.sizes.grains and scene.slots:
             phi = distances(b.shapes, scene.world(p.x).T, pos, mat)[0]
             travel = scene.rigid_dt * jnp.sqrt(jnp.sum(p.v * p.v, axis=0))
             grains = _pick((phi < MOST_TRAVEL * dx + travel) & (p.m > 0), scene.sizes.grains)
         else:
-            grains = (jnp.zeros((0,), jnp.int32), jnp.zeros((0,), bool), jnp.zeros((), bool))
-        return cls(scene, stance, near, used, nodes[near], over, *grains)
+            grains = (jnp.zeros((0,), jnp.int32), jnp.zeros((), bool))
+        return cls(scene, stance, near, nodes.at[near].get(mode="clip"), over, *grains)
 
     def start(self, q: Array) -> Touch:
         """Nothing has happened yet; joints move with q (nv,)."""
@@ -161,13 +159,11 @@ class Contact(NamedTuple):
     def nodes(self, touch: Touch, v: Array, m: Array) -> tuple[Touch, Array]:
         """Exchange momentum between bodies and the grid nodes within the band."""
         at = self._points(touch, self.nodes_x)
-        near = self.nodes_used & (at[0] < self.scene.fidelity.contact_band * self.scene.grid.cell_size)
-        mass = m[self.nodes_near]
-        points = Points(self.nodes_x, lift(v[self.nodes_near].T).T, jnp.where(near, mass, 0), *at)
+        near = at[0] < self.scene.fidelity.contact_band * self.scene.grid.cell_size
+        points = Points(self.nodes_x, lift(v.T).T, jnp.where(near, m, 0), *at)
         free = touch.q + self.scene.mpm_dt * self.stance.acceleration
         touch, done = self._exchange(touch, points, free)
-        change = done.impulse / jnp.where(points.m > 0, points.m, 1)[:, None]
-        return touch, v.at[self.nodes_near].add(self._flatten(change))
+        return touch, self._flatten(done.impulse / jnp.where(points.m > 0, points.m, 1)[:, None])
 
     def grains(self, touch: Touch, p: Particles) -> tuple[Touch, Particles]:
         """Move the bodies, then stop grains that ended up inside them and put those back to the surface."""
@@ -175,10 +171,10 @@ class Contact(NamedTuple):
         if not self.grains_near.size:
             return touch, p
         near = self.grains_near
-        x = self.scene.world(p.x[:, near]).T
+        x = self.scene.world(p.x.at[:, near].get(mode="clip")).T
         phi, n, geom = self._points(touch, x)
-        m = jnp.where(self.grains_used & (phi < 0), p.m[near], 0)
-        points = Points(x, lift(p.v[:, near]).T, m, phi, n, geom)
+        m = jnp.where(phi < 0, p.m.at[near].get(mode="fill", fill_value=0), 0)
+        points = Points(x, lift(p.v.at[:, near].get(mode="clip")).T, m, phi, n, geom)
 
         def stop(touch: Touch) -> tuple[Touch, Array]:
             touch, done = self._exchange(touch, points, touch.q)
@@ -188,8 +184,8 @@ class Contact(NamedTuple):
         touch, change = lax.cond(jnp.any(m > 0), stop, lambda t: (t, jnp.zeros_like(points.v)), touch)
         depth = jnp.where(m > 0, -phi, 0)
         touch = touch._replace(depth=jnp.maximum(touch.depth, jnp.max(depth)))
-        x_new = p.x.at[:, near].add(self._flatten(depth[:, None] * n).T)
-        return touch, replace(p, x=x_new, v=p.v.at[:, near].add(self._flatten(change).T))
+        x_new = p.x.at[:, near].add(self._flatten(depth[:, None] * n).T, mode="drop")
+        return touch, replace(p, x=x_new, v=p.v.at[:, near].add(self._flatten(change).T, mode="drop"))
 
     def coast(self, touch: Touch) -> Touch:
         """A substep without any grain."""
@@ -269,11 +265,10 @@ def _reach(b: rigid.Bodies, body: int) -> float:
     return max((r for r in reaches if np.isfinite(r)), default=0.0)
 
 
-def _pick(mask: Array, size: int) -> tuple[Array, Array, Array]:
-    """Indices (size,) where the mask (n,) holds, which of them are meant, and whether more were."""
-    count = jnp.sum(mask)
-    index = jnp.nonzero(mask, size=size, fill_value=0)[0].astype(jnp.int32)
-    return index, jnp.arange(size) < count, count > size
+def _pick(mask: Array, size: int) -> tuple[Array, Array]:
+    """Indices (size,) where the mask (n,) holds, n where there are fewer, and whether there were more."""
+    index = jnp.nonzero(mask, size=size, fill_value=mask.shape[0])[0].astype(jnp.int32)
+    return index, jnp.sum(mask) > size
 
 
 def _bits(faults: dict[Health, Array]) -> Array:

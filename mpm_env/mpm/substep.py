@@ -32,8 +32,12 @@ class Bed(NamedTuple):
 class Boundary(Protocol):
     """What acts on the grid and the grains between two transfers; `carry` is its own business."""
 
+    @property
+    def watched(self) -> Array:
+        """Indices (K,) into the flattened grid of the nodes it may act on; `grid.nodes` stands for none."""
+
     def nodes(self, carry: Any, v: Array, m: Array) -> tuple[Any, Array]:
-        """Change node velocities v (N, d) m/s given node masses m (N,) kg."""
+        """Change (K, d) m/s of the watched nodes' velocities v (K, d) m/s, given their masses m (K,) kg."""
 
     def grains(self, carry: Any, p: Particles) -> tuple[Any, Particles]:
         """Change grains after they have moved."""
@@ -52,8 +56,15 @@ def substep(
     v, m = node_velocities(p2g(grid, p, dt, chunk_of(p)), dt, gravity)
     v = walls(grid, v)
     if boundary is not None:
-        carry, flat = boundary.nodes(carry, v.reshape(-1, grid.dimension), m.reshape(-1))
-        v = walls(grid, flat.reshape(v.shape))  # a node shared by a wall and a body belongs to the wall
+        at, d = boundary.watched, grid.dimension
+        v_at, m_at = (
+            v.reshape(-1, d).at[at].get(mode="fill", fill_value=0),
+            m.reshape(-1).at[at].get(mode="fill", fill_value=0),
+        )
+        carry, change = boundary.nodes(carry, v_at, m_at)
+        # A node shared by a wall and a body belongs to the wall.
+        change = walls(grid, v_at + change, jnp.unravel_index(at, grid.shape)) - v_at
+        v = v.reshape(-1, d).at[at].add(change, mode="drop").reshape(v.shape)
     for bed in beds:
         p = move(grid, bed, p, v, dt)
     if boundary is not None:
@@ -76,12 +87,15 @@ def node_velocities(nodes: Array, dt: float, gravity: Array) -> tuple[Array, Arr
     return jnp.stack(v, axis=-1), m
 
 
-def walls(grid: Grid, v: Array) -> Array:
-    """Node velocities (*shape, d) that respect the walls; nodes on a wall's plane and behind it are its own."""
+def walls(grid: Grid, v: Array, at: tuple[Array, ...] | None = None) -> Array:
+    """Node velocities (.., d) that respect the walls; nodes on a wall's plane and behind it are its own.
+
+    Of all nodes in the grid's shape, or of those with the indices `at`, one array (..,) per axis.
+    """
     d = grid.dimension
     rows = [v[..., i] for i in range(d)]
     for a, pair in enumerate(grid.walls):
-        index = lax.broadcasted_iota(jnp.int32, v.shape[:-1], a)
+        index = lax.broadcasted_iota(jnp.int32, v.shape[:-1], a) if at is None else at[a]
         for side, wall in enumerate(pair):
             inward = 1 - 2 * side
             behind = index <= MARGIN if side == 0 else index >= MARGIN + grid.cells[a]
