@@ -6,12 +6,15 @@ nothing here knows what is behind it.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple, Protocol
 
+import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
+from mpm_env.mpm import native
 from mpm_env.mpm.linalg3 import matrix_rows
 from mpm_env.mpm.materials import Material
 from mpm_env.mpm.transfer import CHUNK, each_chunk, g2p, p2g
@@ -47,29 +50,62 @@ def substep(
     grid: Grid,
     beds: tuple[Bed, ...],
     p: Particles,
-    dt: float,
+    dt: float | Array,
     gravity: Array,
     boundary: Boundary | None = None,
     carry: Any = None,
+    kernels: str = "auto",
 ) -> tuple[Particles, Any]:
-    """Advance the grains by dt; gravity (d,) m/s^2. Returns the grains and the boundary's carry."""
-    v, m = node_velocities(p2g(grid, p, dt, chunk_of(p)), dt, gravity)
-    v = walls(grid, v)
+    """Advance the grains by dt; gravity (d,) m/s^2. Returns the grains and the boundary's carry.
+
+    kernels: "native" or "xla", two implementations of the same equations, or "auto" (see `mpm_env.mpm.native`).
+    """
+    kernels = "xla" if p.count % native.LANES else native.chosen(kernels)
+    watched = jnp.zeros((0,), jnp.int32) if boundary is None else boundary.watched
+    nodes = to_nodes(grid, p, dt, gravity, watched, kernels)
     if boundary is not None:
-        at, d = boundary.watched, grid.dimension
-        v_at, m_at = (
-            v.reshape(-1, d).at[at].get(mode="fill", fill_value=0),
-            m.reshape(-1).at[at].get(mode="fill", fill_value=0),
-        )
-        carry, change = boundary.nodes(carry, v_at, m_at)
+        d, flat = grid.dimension, nodes.reshape(-1, nodes.shape[-1])
+        seen = flat.at[watched].get(mode="fill", fill_value=0)
+        carry, change = boundary.nodes(carry, seen[:, :d], seen[:, -1])
         # A node shared by a wall and a body belongs to the wall.
-        change = walls(grid, v_at + change, jnp.unravel_index(at, grid.shape)) - v_at
-        v = v.reshape(-1, d).at[at].add(change, mode="drop").reshape(v.shape)
+        change = walls(grid, seen[:, :d] + change, jnp.unravel_index(watched, grid.shape)) - seen[:, :d]
+        change = jnp.pad(change, ((0, 0), (0, nodes.shape[-1] - d)))
+        nodes = flat.at[watched].add(change, mode="drop").reshape(nodes.shape)
     for bed in beds:
-        p = move(grid, bed, p, v, dt)
+        p = move(grid, bed, p, nodes, dt, kernels)
+    p = take_out(grid, p)
     if boundary is not None:
         carry, p = boundary.grains(carry, p)
     return p, carry
+
+
+def to_nodes(grid: Grid, p: Particles, dt: float | Array, gravity: Array, watched: Array, kernels: str) -> Array:
+    """Nodes (*shape, .., mass last): velocity m/s after forces, gravity and walls, and mass kg.
+
+    Where no grain reaches, native kernels define only the nodes `watched`.
+    """
+
+    def reference(p: Particles, dt: float | Array, gravity: Array) -> Array:
+        v, m = node_velocities(p2g(grid, p, dt, chunk_of(p)), dt, gravity)
+        return jnp.concatenate([walls(grid, v), m[..., None]], axis=-1)
+
+    if kernels == "xla":
+        return reference(p, dt, gravity)
+    return native.to_nodes(grid, p, dt, gravity, watched, LEAST_MASS, reference)
+
+
+def move(grid: Grid, bed: Bed, p: Particles, nodes: Array, dt: float | Array, kernels: str) -> Particles:
+    """Gather velocities, move the bed's grains, strain them and ask the material for the stress."""
+    span = (bed.start, bed.stop)
+
+    def reference(p: Particles, nodes: Array, dt: float | Array, material: Material | None) -> Particles:
+        return _moved(grid, material, span, p, nodes, dt)
+
+    if kernels == "xla":
+        return reference(p, nodes, dt, bed.material)
+    if type(bed.material) in native.LAWS:
+        return native.to_grains(grid, bed.material, span, p, nodes, dt, reference)
+    return strain(bed, native.to_grains(grid, None, span, p, nodes, dt, reference), dt)
 
 
 def chunk_of(p: Particles) -> int:
@@ -77,7 +113,7 @@ def chunk_of(p: Particles) -> int:
     return min(CHUNK, p.count)
 
 
-def node_velocities(nodes: Array, dt: float, gravity: Array) -> tuple[Array, Array]:
+def node_velocities(nodes: Array, dt: float | Array, gravity: Array) -> tuple[Array, Array]:
     """Velocity (*shape, d) m/s after forces and gravity, and mass (*shape,) kg, of nodes (*shape, d + 1)."""
     d = nodes.shape[-1] - 1
     m = nodes[..., d]
@@ -111,31 +147,52 @@ def walls(grid: Grid, v: Array, at: tuple[Array, ...] | None = None) -> Array:
     return jnp.stack(rows, axis=-1)
 
 
-def move(grid: Grid, bed: Bed, p: Particles, node_v: Array, dt: float) -> Particles:
-    """Gather velocities, move the bed's grains, strain them and ask the material for the stress."""
+def _moved(
+    grid: Grid, material: Material | None, span: tuple[int, int], p: Particles, nodes: Array, dt: float | Array
+) -> Particles:
+    """The grains of a span after nodes moved them; strained too where a material is given."""
+
+    def one(p: Particles) -> Particles:
+        v, C = lax.optimization_barrier(g2p(grid, nodes, p.x))
+        here = p.m > 0
+        v, C = jnp.where(here, v, 0), jnp.where(here, C, 0)
+        p = replace(p, x=p.x + dt * v, v=v, C=C)
+        return p if material is None else _answered(material, p, dt)
+
+    return _by_chunks(span, p, one)
+
+
+def strain(bed: Bed, p: Particles, dt: float | Array) -> Particles:
+    """Strain the bed's grains by their velocity gradient, and ask the material for the stress."""
+    return _by_chunks((bed.start, bed.stop), p, lambda p: _answered(bed.material, p, dt))
+
+
+def _answered(material: Material, p: Particles, dt: float | Array) -> Particles:
+    e, history, tau = material.update(stretch(p.e, dt * p.C), p.history)
+    return replace(p, e=e, tau=tau, history=history)
+
+
+def _by_chunks(span: tuple[int, int], p: Particles, change: Callable[[Particles], Particles]) -> Particles:
+    """Grains with a span of them changed, a chunk at a time."""
+    start, stop = span
     chunk = chunk_of(p)
 
     def body(k: Array, p: Particles) -> Particles:
-        start = bed.start + k
-
-        def rows(a: Array) -> Array:
-            return lax.dynamic_slice_in_dim(a, start, chunk, axis=-1)
-
-        x, e, history, m = lax.optimization_barrier((rows(p.x), rows(p.e), rows(p.history), rows(p.m)))
-        v, C = lax.optimization_barrier(g2p(grid, node_v, x))
-        here = m > 0
-        v, C = jnp.where(here, v, 0), jnp.where(here, C, 0)
-        x = x + dt * v
-        e, history, tau = bed.material.update(stretch(e, dt * C), history)
-        new = replace(p, x=x, v=v, C=C, e=e, tau=tau, history=history, m=take_out(grid, x, m), V0=p.V0)
-        return Particles(
-            *(
-                old if fresh is old else lax.dynamic_update_slice_in_dim(old, fresh.astype(old.dtype), start, axis=-1)
-                for old, fresh in ((getattr(p, f), getattr(new, f)) for f in p.__dataclass_fields__)
-            )
+        some = jax.tree.map(lambda a: lax.dynamic_slice_in_dim(a, start + k, chunk, axis=-1), p)
+        some = lax.optimization_barrier(some)
+        new = change(some)
+        return jax.tree.map(
+            lambda whole, old, fresh: (
+                whole
+                if fresh is old
+                else lax.dynamic_update_slice_in_dim(whole, fresh.astype(whole.dtype), start + k, axis=-1)
+            ),
+            p,
+            some,
+            new,
         )
 
-    return each_chunk(bed.stop - bed.start, body, p, chunk)
+    return each_chunk(stop - start, body, p, chunk)
 
 
 def stretch(e: Array, G: Array) -> Array:
@@ -156,12 +213,13 @@ def stretch(e: Array, G: Array) -> Array:
     return jnp.stack([entry(0, 0), entry(1, 1), entry(2, 2), entry(1, 2), entry(0, 2), entry(0, 1)])
 
 
-def take_out(grid: Grid, x: Array, m: Array) -> Array:
-    """Masses (n,) with those of grains beyond an open wall set to zero: they have left."""
+def take_out(grid: Grid, p: Particles) -> Particles:
+    """Grains without those beyond an open wall, whose mass becomes zero: they have left."""
+    m = p.m
     for a, (lower, upper) in enumerate(grid.walls):
         first = MARGIN * grid.cell_size
         if lower.kind == "open":
-            m = jnp.where(x[a] < first, 0, m)
+            m = jnp.where(p.x[a] < first, 0, m)
         if upper.kind == "open":
-            m = jnp.where(x[a] > first + grid.cells[a] * grid.cell_size, 0, m)
-    return m
+            m = jnp.where(p.x[a] > first + grid.cells[a] * grid.cell_size, 0, m)
+    return p if m is p.m else replace(p, m=m)

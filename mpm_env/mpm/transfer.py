@@ -24,9 +24,10 @@ def weights(x: Array, cell_size: float, shape: tuple[int, ...]) -> tuple[Array, 
     """First node (d, n) of each grain's window, and per axis and node the weights (n,) and offsets x_i - x_p (n,) in m.
 
     Quadratic B-splines (J16 eq. 123). A window that would leave the grid is moved back inside: the caller flags it.
+    Along the last axis one node beyond it stays on the grid, since the native kernels read rows of four.
     """
     s = x / cell_size
-    last = jnp.asarray([n - 3 for n in shape], jnp.int32)[:, None]
+    last = jnp.asarray([*(n - 3 for n in shape[:-1]), shape[-1] - 4], jnp.int32)[:, None]
     base = jnp.clip(jnp.floor(s - 0.5).astype(jnp.int32), 0, last)
     # The barrier makes every use below see the same window, however XLA rounds the position in each fusion.
     base, s = lax.optimization_barrier((base, s))
@@ -66,7 +67,7 @@ def each_chunk(count: int, body: Callable[[Array, T], T], carry: T, chunk: int =
     return lax.fori_loop(0, count // chunk, lambda k, c: body(k * chunk, c), carry)
 
 
-def p2g(grid: Grid, p: Particles, dt: float, chunk: int = CHUNK) -> Array:
+def p2g(grid: Grid, p: Particles, dt: float | Array, chunk: int = CHUNK) -> Array:
     """Momentum and mass on the nodes, (*shape, d + 1) kg m/s and kg, internal forces over dt included.
 
     A node gets w (m v + (m C - dt V0 tau / D) (x_i - x_p)) with D = dx^2/4: APIC's affine momentum and MLS-MPM's

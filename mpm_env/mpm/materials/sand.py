@@ -54,6 +54,12 @@ class Sand:
         """Slope of the cone: |s| <= -alpha (tr(tau) - 3 c cot(phi)) for the Kirchhoff deviator s."""
         return FRICTION_FITS[self.friction_fit](jnp.sin(jnp.maximum(self.friction, LEAST_FRICTION)))
 
+    @property
+    def tip(self) -> Array:
+        """Volumetric strain at the tip of the cone, which cohesion shifts to the tension c cot(phi)."""
+        lam, mu = lame(self.E, self.nu)
+        return self.cohesion / ((lam + 2 * mu / 3) * jnp.tan(jnp.maximum(self.friction, LEAST_FRICTION)))
+
     def update(self, e: Array, history: Array) -> tuple[Array, Array, Array]:
         """Project the trial strain onto the cone: elastic inside, tip in tension, cone otherwise (K16 section 6.3)."""
         lam, mu = lame(self.E, self.nu)
@@ -61,8 +67,7 @@ class Sand:
         values, axes = eigen(e)
         eps_trial = 0.5 * jnp.log1p(jnp.maximum(values, LEAST_B - 1))
         eps = eps_trial + history[0] / 3 if self.volume_correction else eps_trial
-        # Cohesion shifts the tip of the cone to the tension c cot(phi), as a volumetric strain.
-        tip = self.cohesion / (bulk * jnp.tan(jnp.maximum(self.friction, LEAST_FRICTION)))
+        tip = self.tip
         tr = jnp.sum(eps, axis=0)
         deviator = eps - tr / 3
         norm = jnp.sqrt(jnp.sum(deviator * deviator, axis=0) + TINY)

@@ -1,0 +1,111 @@
+// What XLA calls: unpacks buffers and attributes, and picks the kernels for this processor.
+#include <cstdlib>
+#include <string_view>
+
+#include "kernels.h"
+#include "xla/ffi/api/c_api.h"
+#include "xla/ffi/api/ffi.h"
+
+namespace ffi = xla::ffi;
+
+namespace {
+
+using Ints = ffi::Span<const int64_t>;
+using Floats = ffi::Span<const double>;
+
+// MPM_ENV_WIDTH=narrow keeps to the narrower registers, for tests.
+bool has_wide() {
+#if defined(__x86_64__)
+  static const char* wish = std::getenv("MPM_ENV_WIDTH");
+  if (wish && std::string_view(wish) == "narrow") return false;
+  return __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl") &&
+         __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512cd");
+#else
+  return false;
+#endif
+}
+
+bool has_narrow() {
+#if defined(__x86_64__)
+  return __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") && __builtin_cpu_supports("bmi2");
+#else
+  return true;
+#endif
+}
+
+GridShape grid_of(Ints shape, Ints kinds, Floats friction, double cell_size, int64_t margin) {
+  GridShape g{};
+  g.dim = int64_t(shape.size());
+  for (int64_t a = 0; a < g.dim; ++a) g.shape[a] = shape[a];
+  for (int64_t i = 0; i < 2 * g.dim; ++i) { g.wall_kind[i] = kinds[i]; g.wall_friction[i] = friction[i]; }
+  g.cell_size = cell_size;
+  g.margin = margin;
+  return g;
+}
+
+// All dimensions in front of an array's own `rank` ones are environments.
+int64_t batch_of(const ffi::AnyBuffer& a, size_t rank) {
+  int64_t n = 1;
+  for (size_t i = 0; i + rank < a.dimensions().size(); ++i) n *= a.dimensions()[i];
+  return n;
+}
+
+ffi::Error to_nodes(ffi::AnyBuffer x, ffi::AnyBuffer v, ffi::AnyBuffer C, ffi::AnyBuffer tau, ffi::AnyBuffer m,
+                    ffi::AnyBuffer V0, ffi::AnyBuffer step, ffi::AnyBuffer watched, ffi::Result<ffi::AnyBuffer> nodes,
+                    Ints shape, Ints kinds, Floats friction, double cell_size, int64_t margin, double least_mass) {
+  ToNodes t{};
+  t.grid = grid_of(shape, kinds, friction, cell_size, margin);
+  t.batch = batch_of(x, 2);
+  t.grains = x.dimensions().back();
+  t.watch = watched.dimensions().back();
+  t.x = x.untyped_data(); t.v = v.untyped_data(); t.C = C.untyped_data(); t.tau = tau.untyped_data();
+  t.m = m.untyped_data(); t.V0 = V0.untyped_data(); t.step = step.untyped_data();
+  t.watched = static_cast<const int32_t*>(watched.untyped_data());
+  t.least_mass = least_mass;
+  t.nodes = nodes->untyped_data();
+  (has_wide() ? wide::to_nodes : narrow::to_nodes)(t, x.element_type() == ffi::F64);
+  return ffi::Error::Success();
+}
+
+// The results share memory with the operands of the same name.
+ffi::Error to_grains(ffi::AnyBuffer nodes, ffi::AnyBuffer m, ffi::AnyBuffer parameter, ffi::AnyBuffer, ffi::AnyBuffer,
+                     ffi::AnyBuffer, ffi::AnyBuffer, ffi::AnyBuffer, ffi::AnyBuffer, ffi::Result<ffi::AnyBuffer> x,
+                     ffi::Result<ffi::AnyBuffer> v, ffi::Result<ffi::AnyBuffer> C, ffi::Result<ffi::AnyBuffer> e,
+                     ffi::Result<ffi::AnyBuffer> tau, ffi::Result<ffi::AnyBuffer> history, Ints shape, Ints kinds,
+                     Floats friction, double cell_size, int64_t margin, int64_t law, int64_t start, int64_t stop) {
+  ToGrains t{};
+  t.grid = grid_of(shape, kinds, friction, cell_size, margin);
+  t.batch = batch_of(*x, 2);
+  t.grains = x->dimensions().back();
+  t.memory = history->dimensions()[history->dimensions().size() - 2];
+  t.start = start;
+  t.stop = stop;
+  t.parameters = parameter.dimensions().back();
+  t.law = static_cast<Law>(law);
+  t.nodes = nodes.untyped_data(); t.m = m.untyped_data(); t.parameter = parameter.untyped_data();
+  t.x = x->untyped_data(); t.v = v->untyped_data(); t.C = C->untyped_data(); t.e = e->untyped_data();
+  t.tau = tau->untyped_data(); t.history = history->untyped_data();
+  (has_wide() ? wide::to_grains : narrow::to_grains)(t, x->element_type() == ffi::F64);
+  return ffi::Error::Success();
+}
+
+#define GRID_ATTRIBUTES \
+  .Attr<Ints>("shape").Attr<Ints>("kinds").Attr<Floats>("friction").Attr<double>("cell_size").Attr<int64_t>("margin")
+#define ARG Arg<ffi::AnyBuffer>()
+#define RET Ret<ffi::AnyBuffer>()
+
+}  // namespace
+
+XLA_FFI_DEFINE_HANDLER_SYMBOL(mpm_env_to_nodes, to_nodes,
+                              ffi::Ffi::Bind().ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.RET GRID_ATTRIBUTES.Attr<double>("least_mass"));
+XLA_FFI_DEFINE_HANDLER_SYMBOL(mpm_env_to_grains, to_grains,
+                              ffi::Ffi::Bind().ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.RET.RET.RET.RET.RET.RET GRID_ATTRIBUTES
+                                  .Attr<int64_t>("law").Attr<int64_t>("start").Attr<int64_t>("stop"));
+
+// Read through ctypes before anything is registered.
+extern "C" {
+const char* mpm_env_source() { return MPM_SOURCE; }      // hash of the files that this was built from
+int mpm_env_api() { return XLA_FFI_API_MAJOR * 1000 + XLA_FFI_API_MINOR; }
+int mpm_env_runs_here() { return has_narrow(); }
+const char* mpm_env_width() { return has_wide() ? "AVX-512" : MPM_NARROW; }
+}

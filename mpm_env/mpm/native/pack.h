@@ -1,0 +1,194 @@
+// Sixteen numbers at once, in as many machine registers as that takes: what the kernels are written in.
+// NATIVE_BYTES is the width of a register; the same source serves AVX-512, AVX2 and everything else.
+#pragma once
+#include <cstdint>
+#include <cstring>
+#if defined(__AVX512F__) && defined(__AVX512DQ__)
+#include <immintrin.h>
+#define NATIVE_BYTES 64
+#elif defined(__AVX2__)
+#include <immintrin.h>
+#define NATIVE_BYTES 32
+#else
+#define NATIVE_BYTES 16
+#endif
+#define INLINE inline __attribute__((always_inline))
+
+namespace MPM_ISA {
+
+constexpr int W = 16;  // lanes of a pack
+
+template <class S> struct IntOf;
+template <> struct IntOf<float> { typedef int32_t type; static constexpr int mantissa = 23, bias = 127; };
+template <> struct IntOf<double> { typedef int64_t type; static constexpr int mantissa = 52, bias = 1023; };
+
+template <> struct IntOf<int32_t> { typedef int32_t type; };
+template <> struct IntOf<int64_t> { typedef int64_t type; };
+
+// T is float, double, or the integer of the same size (then also a mask: 0 or all bits per lane).
+template <class T> struct Pack {
+  typedef T Part __attribute__((vector_size(NATIVE_BYTES)));
+  static constexpr int N = NATIVE_BYTES / sizeof(T);  // lanes of a part
+  static constexpr int K = W / N;                     // parts
+  Part p[K];
+  INLINE Pack() {}
+  INLINE Pack(T a) { for (int k = 0; k < K; ++k) p[k] = Part{} + a; }
+  static INLINE Pack load(const T* a) { Pack r; std::memcpy(r.p, a, sizeof r.p); return r; }
+  INLINE void store(T* a) const { std::memcpy(a, p, sizeof p); }
+};
+
+#define ON_PARTS(T, expr) Pack<T> r; for (int k = 0; k < Pack<T>::K; ++k) r.p[k] = (expr); return r
+#define OPERATOR(op) \
+  template <class T> INLINE Pack<T> operator op(Pack<T> a, Pack<T> b) { ON_PARTS(T, a.p[k] op b.p[k]); } \
+  template <class T> INLINE Pack<T> operator op(Pack<T> a, T b) { return a op Pack<T>(b); } \
+  template <class T> INLINE Pack<T> operator op(T a, Pack<T> b) { return Pack<T>(a) op b; }
+OPERATOR(+) OPERATOR(-) OPERATOR(*) OPERATOR(/) OPERATOR(&) OPERATOR(|) OPERATOR(>>) OPERATOR(<<)
+#undef OPERATOR
+template <class T> INLINE Pack<T> operator-(Pack<T> a) { ON_PARTS(T, -a.p[k]); }
+template <class T> INLINE Pack<T> operator~(Pack<T> a) { ON_PARTS(T, ~a.p[k]); }
+
+template <class S> using Bits = Pack<typename IntOf<S>::type>;
+#define COMPARE(op) \
+  template <class S> INLINE Bits<S> operator op(Pack<S> a, Pack<S> b) { \
+    Bits<S> r; for (int k = 0; k < Pack<S>::K; ++k) r.p[k] = (typename Bits<S>::Part)(a.p[k] op b.p[k]); return r; } \
+  template <class S> INLINE Bits<S> operator op(Pack<S> a, S b) { return a op Pack<S>(b); }
+COMPARE(<) COMPARE(>) COMPARE(>=)
+#undef COMPARE
+template <class S> INLINE Pack<S> select(Bits<S> mask, Pack<S> a, Pack<S> b) { ON_PARTS(S, mask.p[k] ? a.p[k] : b.p[k]); }
+template <class S> INLINE Bits<S> bits(Pack<S> a) { Bits<S> r; std::memcpy(r.p, a.p, sizeof r.p); return r; }
+template <class S> INLINE Pack<S> floats(Bits<S> a) { Pack<S> r; std::memcpy(r.p, a.p, sizeof r.p); return r; }
+template <class S> INLINE Pack<S> number(Bits<S> a) { ON_PARTS(S, __builtin_convertvector(a.p[k], typename Pack<S>::Part)); }
+template <class S> INLINE Bits<S> whole(Pack<S> a) {  // towards zero
+  Bits<S> r; for (int k = 0; k < Pack<S>::K; ++k) r.p[k] = __builtin_convertvector(a.p[k], typename Bits<S>::Part); return r; }
+template <class S> INLINE Bits<S> floored(Pack<S> a) { Bits<S> i = whole(a); return i + (a < number<S>(i)); }
+template <class T> INLINE bool any(Pack<T> mask) {
+  T r = 0; for (int k = 0; k < Pack<T>::K; ++k) for (int l = 0; l < Pack<T>::N; ++l) r |= mask.p[k][l]; return r != 0; }
+
+// These keep a NaN in their first argument, so that a sick grain stays visible.
+template <class S> INLINE Pack<S> largest(Pack<S> a, S b) { return select<S>(a < b, Pack<S>(b), a); }
+template <class S> INLINE Pack<S> smallest(Pack<S> a, S b) { return select<S>(a > b, Pack<S>(b), a); }
+template <class S> INLINE Pack<S> magnitude(Pack<S> a) { return floats<S>(bits(a) & Pack<typename IntOf<S>::type>(~(typename IntOf<S>::type(1) << (8 * sizeof(S) - 1)))); }
+template <class S> INLINE Pack<S> with_sign(Pack<S> size, Pack<S> sign) {  // size >= 0
+  typedef typename IntOf<S>::type I;
+  return floats<S>(bits(size) | (bits(sign) & Pack<I>(I(1) << (8 * sizeof(S) - 1)))); }
+
+INLINE float root(float a) { return __builtin_sqrtf(a); }
+INLINE double root(double a) { return __builtin_sqrt(a); }
+template <class S> INLINE Pack<S> root(Pack<S> a) {
+  Pack<S> r;
+#if NATIVE_BYTES == 64
+  for (int k = 0; k < Pack<S>::K; ++k)
+    if constexpr (sizeof(S) == 4) r.p[k] = (typename Pack<S>::Part)_mm512_sqrt_ps((__m512)a.p[k]);
+    else r.p[k] = (typename Pack<S>::Part)_mm512_sqrt_pd((__m512d)a.p[k]);
+#elif NATIVE_BYTES == 32
+  for (int k = 0; k < Pack<S>::K; ++k)
+    if constexpr (sizeof(S) == 4) r.p[k] = (typename Pack<S>::Part)_mm256_sqrt_ps((__m256)a.p[k]);
+    else r.p[k] = (typename Pack<S>::Part)_mm256_sqrt_pd((__m256d)a.p[k]);
+#else
+  for (int k = 0; k < Pack<S>::K; ++k) for (int l = 0; l < Pack<S>::N; ++l) r.p[k][l] = root(a.p[k][l]);
+#endif
+  return r;
+}
+template <class S> INLINE Pack<S> per_root(Pack<S> a) {  // 1 / sqrt(a) for a > 0
+#if NATIVE_BYTES == 64
+  if constexpr (sizeof(S) == 4) {
+    Pack<S> r; r.p[0] = (typename Pack<S>::Part)_mm512_rsqrt14_ps((__m512)a.p[0]);
+    return r * (S(1.5) - S(0.5) * a * r * r);  // one Newton step: 14 bits become 24
+  } else {
+    Pack<S> r; for (int k = 0; k < Pack<S>::K; ++k) r.p[k] = (typename Pack<S>::Part)_mm512_rsqrt14_pd((__m512d)a.p[k]);
+    for (int i = 0; i < 2; ++i) r = r * (S(1.5) - S(0.5) * a * r * r);
+    return r;
+  }
+#endif
+  return S(1) / root(a);
+}
+
+// ln(1 + x), x > -1, to the last digits also for small x: 1 + x = 2^k (1 + r), then ln(1 + r) = 2 artanh(r / (2 + r)).
+template <class S> INLINE Pack<S> log1p(Pack<S> x) {
+  typedef typename IntOf<S>::type I;
+  constexpr int terms = sizeof(S) == 4 ? 4 : 10;
+  Bits<S> k = (bits((x + S(1)) * S(1.41421356237309504880)) >> I(IntOf<S>::mantissa)) - I(IntOf<S>::bias);
+  Pack<S> scale = floats<S>((I(IntOf<S>::bias) - k) << I(IntOf<S>::mantissa));  // 2^-k
+  Pack<S> r = x * scale + (scale - S(1)), s = r / (r + S(2)), s2 = s * s, sum(S(2) / S(2 * terms + 1));
+  for (int i = terms - 1; i >= 0; --i) sum = sum * s2 + S(2) / S(2 * i + 1);
+  return s * sum + number<S>(k) * S(0.69314718055994530942);
+}
+
+// exp(x) - 1 to the last digits also for small x; |x| below the type's range of exponents.
+template <class S> INLINE Pack<S> expm1(Pack<S> x) {
+  typedef typename IntOf<S>::type I;
+  constexpr int order = sizeof(S) == 4 ? 7 : 14;
+  Bits<S> k = floored(x * S(1.44269504088896340736) + S(0.5));
+  Pack<S> n = number<S>(k);
+  Pack<S> r = sizeof(S) == 4 ? (x - n * S(0.693145751953125)) - n * S(1.42860682030941723212e-6)
+                             : (x - n * S(6.93147180369123816490e-01)) - n * S(1.90821492927058770002e-10);
+  Pack<S> sum(S(1));  // r + r^2/2! + ... as r (1 + r/2 (1 + r/3 (...)))
+  for (int i = order; i >= 2; --i) sum = sum * r * (S(1) / S(i)) + S(1);
+  Pack<S> scale = floats<S>((k + I(IntOf<S>::bias)) << I(IntOf<S>::mantissa));
+  return sum * r * scale + (scale - S(1));
+}
+
+// A block of N parts as the rows of a matrix, transposed in place by halving.
+template <class S, int N> INLINE void transpose_block(typename Pack<S>::Part* r) {
+  typename Bits<S>::Part low, high;
+#pragma GCC unroll 4
+  for (int h = N / 2; h >= 1; h /= 2) {
+    for (int l = 0; l < N; ++l) { low[l] = l & h ? N + l - h : l; high[l] = l & h ? N + l : l + h; }
+#pragma GCC unroll 16
+    for (int i = 0; i < N; ++i)
+      if (!(i & h)) {
+        typename Pack<S>::Part x = r[i], y = r[i + h];
+        r[i] = __builtin_shuffle(x, y, low);
+        r[i + h] = __builtin_shuffle(x, y, high);
+      }
+  }
+}
+
+// Sixteen packs as the rows of a matrix, transposed in place.
+template <class S> INLINE void transpose(Pack<S>* r) {
+  constexpr int N = Pack<S>::N, K = Pack<S>::K;
+  typename Pack<S>::Part block[K][K][N];
+  for (int a = 0; a < K; ++a)
+    for (int b = 0; b < K; ++b) {
+      for (int i = 0; i < N; ++i) block[a][b][i] = r[a * N + i].p[b];
+      transpose_block<S, N>(block[a][b]);
+    }
+  for (int a = 0; a < K; ++a)
+    for (int b = 0; b < K; ++b)
+      for (int i = 0; i < N; ++i) r[b * N + i].p[a] = block[a][b][i];
+}
+
+// Four numbers, repeated over the lanes.
+template <class S> INLINE Pack<S> repeated(const S* four) {
+  Pack<S> r;
+#if NATIVE_BYTES == 64
+  if constexpr (sizeof(S) == 4) { r.p[0] = (typename Pack<S>::Part)_mm512_broadcast_f32x4(_mm_loadu_ps(four)); return r; }
+  else { for (auto& p : r.p) p = (typename Pack<S>::Part)_mm512_broadcast_f64x4(_mm256_loadu_pd(four)); return r; }
+#else
+  for (int k = 0; k < Pack<S>::K; ++k)
+    for (int l = 0; l < Pack<S>::N; l += 4) std::memcpy((S*)&r.p[k] + l, four + (k * Pack<S>::N) % 4, sizeof(S) * (Pack<S>::N < 4 ? Pack<S>::N : 4));
+  return r;
+#endif
+}
+
+// Sums over each pack's four groups of four lanes, the sums of a, b, c and d behind each other.
+template <class S> INLINE Pack<S> group_sums(Pack<S> a, Pack<S> b, Pack<S> c, Pack<S> d) {
+#if NATIVE_BYTES == 64
+  if constexpr (sizeof(S) == 4) {
+    __m512 A = (__m512)a.p[0], B = (__m512)b.p[0], C = (__m512)c.p[0], D = (__m512)d.p[0];
+    __m512 u = _mm512_shuffle_f32x4(A, B, 0x44) + _mm512_shuffle_f32x4(A, B, 0xee);
+    __m512 w = _mm512_shuffle_f32x4(C, D, 0x44) + _mm512_shuffle_f32x4(C, D, 0xee);
+    Pack<S> r;
+    r.p[0] = (typename Pack<S>::Part)(_mm512_shuffle_f32x4(u, w, 0x88) + _mm512_shuffle_f32x4(u, w, 0xdd));
+    return r;
+  }
+#endif
+  typedef S Quad __attribute__((vector_size(4 * sizeof(S))));
+  Quad in[16], out[4];
+  std::memcpy(in, &a, sizeof a); std::memcpy(in + 4, &b, sizeof b);
+  std::memcpy(in + 8, &c, sizeof c); std::memcpy(in + 12, &d, sizeof d);
+  for (int i = 0; i < 4; ++i) out[i] = (in[4 * i] + in[4 * i + 1]) + (in[4 * i + 2] + in[4 * i + 3]);
+  return Pack<S>::load((const S*)out);
+}
+
+}  // namespace MPM_ISA
