@@ -76,6 +76,8 @@ def p2g(grid: Grid, p: Particles, dt: float | Array, chunk: int = CHUNK) -> Arra
     d, n = p.x.shape
     per_D = 4 / grid.cell_size**2
     scatter, _ = _windows(d)
+    # The product with a hidden one makes the transpose part of a loop fusion, nine times faster than XLA's own.
+    one = lax.optimization_barrier(jnp.ones((), p.x.dtype))
 
     def body(start: Array, nodes: Array) -> Array:
         def rows(a: Array) -> Array:
@@ -94,8 +96,6 @@ def p2g(grid: Grid, p: Particles, dt: float | Array, chunk: int = CHUNK) -> Arra
         for a in range(1, d):
             W, values = W[..., None, :] * w_axis[a], values[..., None, :, :] + slopes[a]
         values = (lax.optimization_barrier(W)[..., None, :] * values).reshape(-1, chunk)
-        # The product with a hidden one makes the transpose part of a loop fusion, nine times faster than XLA's own.
-        one = lax.optimization_barrier(jnp.ones((), x.dtype))
         updates = lax.optimization_barrier(lax.optimization_barrier(values).T * one).reshape(chunk, *(3,) * d, d + 1)
         return lax.scatter_add(nodes, base.T, updates, scatter, mode=lax.GatherScatterMode.PROMISE_IN_BOUNDS)
 

@@ -13,7 +13,7 @@ import os
 import re
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.custom_derivatives import SymbolicZero
 
 from mpm_env.mpm.materials import Elastic, Material, Sand, Snow
 from mpm_env.mpm.materials.protocol import LEAST_B, lame
@@ -100,9 +101,10 @@ def to_nodes(
         arrays = (p.x, p.v, p.C, p.tau, p.m, p.V0, step, watched)
         return call(*arrays, **_attributes(grid), least_mass=np.float64(least_mass))
 
-    @kernel.defjvp
-    def _(primals: Any, tangents: Any) -> Any:
-        return jax.jvp(lambda *a: _padded(reference(*a)), primals[:3], tangents[:3])
+    def rule(primals: Any, tangents: Any) -> Any:
+        return _derivative(lambda p, dt, gravity, watched: _padded(reference(p, dt, gravity)), primals, tangents)
+
+    kernel.defjvp(rule, symbolic_zeros=True)
 
     return kernel(p, jnp.asarray(dt, p.x.dtype), gravity, watched)
 
@@ -136,11 +138,22 @@ def to_grains(
         x, v, C, e, tau, history = call(nodes, p.m, row, *moved, **_attributes(grid), **job)
         return replace(p, x=x, v=v, C=C, e=e, tau=tau, history=history)
 
-    @kernel.defjvp
-    def _(primals: Any, tangents: Any) -> Any:
-        return jax.jvp(reference, primals, tangents)
+    kernel.defjvp(partial(_derivative, reference), symbolic_zeros=True)
 
     return kernel(p, nodes, jnp.asarray(dt, p.x.dtype), material)
+
+
+def _derivative(reference: Callable[..., Any], primals: Any, tangents: Any) -> Any:
+    """Value and derivative of the reference along the tangents that are not zero for sure."""
+    values, shape = jax.tree.flatten(primals)
+    slopes = jax.tree.leaves(tangents)
+    live = [i for i, t in enumerate(slopes) if not isinstance(t, SymbolicZero)]
+
+    def along(*some: Array) -> Any:
+        given = dict(zip(live, some, strict=True))
+        return reference(*jax.tree.unflatten(shape, [given.get(i, value) for i, value in enumerate(values)]))
+
+    return jax.jvp(along, [values[i] for i in live], [slopes[i] for i in live])
 
 
 def _elastic(m: Elastic) -> tuple[int, tuple[Any, ...]]:

@@ -225,7 +225,7 @@ template <class S, int D> struct Snow {
     // (1 + a)(1 + b)(1 + c) - 1 without losing the digits of small a, b, c.
     auto joint = [](const Pack<S>* a) { Pack<S> ab = a[0] + a[1] + a[0] * a[1]; return ab + a[2] + ab * a[2]; };
     memory = smallest(memory + log1p(joint(ratio)), most_ln_Jp);
-    Pack<S> Jp = largest(expm1(memory) + S(1), least_Jp), harder = expm1(xi * (S(1) - Jp)) + S(1), Jm1 = joint(s);
+    Pack<S> Jp = largest(exp(memory), least_Jp), harder = exp(xi * (S(1) - Jp)), Jm1 = joint(s);
     Pack<S> volume = lam * Jm1 * (S(1) + Jm1);
     for (auto& a : s) a = harder * (S(2) * mu * a * (S(1) + a) + volume);
     e = compose(r, g);

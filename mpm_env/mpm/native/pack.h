@@ -114,18 +114,31 @@ template <class S> INLINE Pack<S> log1p(Pack<S> x) {
   return s * sum + number<S>(k) * S(0.69314718055994530942);
 }
 
-// exp(x) - 1 to the last digits also for small x; |x| below the type's range of exponents.
-template <class S> INLINE Pack<S> expm1(Pack<S> x) {
+// exp(x) as 2^k (1 + part): part = exp(r) - 1 for a small r. Beyond the range of exponents, as far as that goes.
+template <class S> INLINE Pack<S> exp_part(Pack<S> x, Pack<S>& power) {
   typedef typename IntOf<S>::type I;
   constexpr int order = sizeof(S) == 4 ? 7 : 14;
+  constexpr S most = sizeof(S) == 4 ? S(87) : S(708);
+  x = smallest(largest(x, -most), most);
   Bits<S> k = floored(x * S(1.44269504088896340736) + S(0.5));
   Pack<S> n = number<S>(k);
   Pack<S> r = sizeof(S) == 4 ? (x - n * S(0.693145751953125)) - n * S(1.42860682030941723212e-6)
                              : (x - n * S(6.93147180369123816490e-01)) - n * S(1.90821492927058770002e-10);
   Pack<S> sum(S(1));  // r + r^2/2! + ... as r (1 + r/2 (1 + r/3 (...)))
   for (int i = order; i >= 2; --i) sum = sum * r * (S(1) / S(i)) + S(1);
-  Pack<S> scale = floats<S>((k + I(IntOf<S>::bias)) << I(IntOf<S>::mantissa));
-  return sum * r * scale + (scale - S(1));
+  power = floats<S>((k + I(IntOf<S>::bias)) << I(IntOf<S>::mantissa));
+  return sum * r;
+}
+
+template <class S> INLINE Pack<S> exp(Pack<S> x) {
+  Pack<S> power, part = exp_part(x, power);
+  return part * power + power;
+}
+
+// exp(x) - 1 to the last digits also for small x.
+template <class S> INLINE Pack<S> expm1(Pack<S> x) {
+  Pack<S> power, part = exp_part(x, power);
+  return part * power + (power - S(1));
 }
 
 // A block of N parts as the rows of a matrix, transposed in place by halving.
