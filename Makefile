@@ -14,7 +14,7 @@ RIGHT_VERSION := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3,
 WILL_DO := import ensurepip, venv; $(RIGHT_VERSION)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-fast lint format pins clean
+.PHONY: help setup demo bench test test-fast lint format pins clean
 
 help:  ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /\1: /p' $(MAKEFILE_LIST) | awk -F': ' '{ printf "  make %-10s %s\n", $$1, $$2 }'
@@ -23,6 +23,9 @@ setup: $(READY)  ## make .venv with the pinned packages (the other targets do it
 
 demo: $(READY)  ## dig sand, write the log and pictures to demo_out/ (ARGS=... adds options)
 	$(BIN)/mpm-env demo dig --out demo_out $(ARGS)
+
+bench: $(READY)  ## all benchmarks, into docs/performance.md (ARGS=--quick; PEERS=folder, see benchmarks/README.md)
+	$(BIN)/python -m benchmarks $(ARGS) $(if $(PEERS),--peers $(PEERS))
 
 test: $(READY)  ## all tests, a process per core
 	$(BIN)/python -m pytest -n auto --dist loadfile $(ARGS)
@@ -51,7 +54,7 @@ clean:  ## remove what the other targets made, .venv too
 
 # A .venv made by hand is kept and brought to the pinned versions; one that does not run is made anew. The build
 # tools come first, so that they are pinned like the rest and the package builds without a second environment.
-$(READY): pyproject.toml constraints.txt
+$(READY): pyproject.toml constraints.txt $(wildcard mpm_env/mpm/native/*.h mpm_env/mpm/native/*.cpp mpm_env/mpm/native/build.py)
 	@if ! $(BIN)/python -c '' 2>/dev/null; then \
 		for python in $(CANDIDATES); do \
 			if "$$python" -c '$(WILL_DO)' 2>/dev/null; then found="$$python"; break; fi; \
@@ -70,6 +73,6 @@ $(READY): pyproject.toml constraints.txt
 	fi
 	@echo "installing the pinned packages into $(VENV) (the first time takes minutes)"
 	@$(BIN)/python -m pip --version >/dev/null 2>&1 || $(BIN)/python -m ensurepip
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt hatchling editables
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt hatchling editables jaxlib
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt --no-build-isolation -e '.[dev]'
 	@touch $@

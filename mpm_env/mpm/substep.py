@@ -109,8 +109,8 @@ def move(grid: Grid, bed: Bed, p: Particles, nodes: Array, dt: float | Array, ke
 
 
 def chunk_of(p: Particles) -> int:
-    """How many grains are walked through at a time."""
-    return min(CHUNK, p.count)
+    """How many grains are walked through at a time: on a GPU all of them, since each chunk would wait for the last."""
+    return min(CHUNK, p.count) if jax.default_backend() == "cpu" else p.count
 
 
 def node_velocities(nodes: Array, dt: float | Array, gravity: Array) -> tuple[Array, Array]:

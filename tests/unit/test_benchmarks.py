@@ -1,0 +1,68 @@
+"""The benchmarks' arithmetic, and one of them run small, so that they do not rot."""
+
+import json
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from benchmarks import box, report
+from benchmarks.clock import in_turns, spread
+from benchmarks.throughput import HEAPS, fit, same_job
+
+ROOT = Path(__file__).resolve().parent.parent.parent
+
+
+def test_fit_finds_the_line_that_made_the_times() -> None:
+    ns, fixed, size, base = 50e-9, 20e-6, 400, 300.0
+    rows = []
+    for grains in (2_000, 60_000, 1_000_000):
+        rate = grains / (fixed + ns * grains) / 1e6
+        memory = base + size * grains / 2**20
+        rows.append({"grains": grains, "Mpss_cpu": spread([rate], 12), "rss_mb": spread([memory], 12)})
+    found = fit(rows)
+    assert found["ns_per_grain"] == pytest.approx(50, rel=0.01)
+    assert found["fixed_us"] == pytest.approx(20, rel=0.02)
+    assert found["bytes_per_grain"] == pytest.approx(size, rel=0.01)
+    assert 0.8 < found["exponent"] < 1
+
+
+def test_same_job_is_the_worst_of_the_heap_s_numbers() -> None:
+    row = {"n": 10} | HEAPS[10]
+    assert same_job(row) == 0
+    assert same_job(row | {"zcom": 1.01 * HEAPS[10]["zcom"]}) == pytest.approx(0.01)
+
+
+@pytest.mark.parametrize(("late", "settled"), [(0.0, True), (0.1, False)])
+def test_box_that_keeps_moving_has_not_settled(late: float, settled: bool) -> None:
+    speeds = [-0.5, -0.9, -0.3, *[0.0] * 40, *[late * (-1) ** k for k in range(10)]]
+    assert box.verdict(speeds, 0.02)["settled"] is settled
+
+
+def test_box_that_bounces_has_not_settled() -> None:
+    assert box.verdict([-0.9] * 6 + [1.2] + [0.0] * 43, 0.02)["settled"] is False
+
+
+def test_rivals_take_turns_after_one_unmeasured_round() -> None:
+    seen: list[str] = []
+    times = in_turns({name: lambda name=name: seen.append(name) for name in "ab"}, rounds=2)
+    assert "".join(seen) == "ababab"
+    assert {name: len(values) for name, values in times.items()} == {"a": 2, "b": 2}
+
+
+def test_report_needs_no_results(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(report.results, "FOLDER", tmp_path)
+    assert "| - |" in report.goals()
+
+
+@pytest.mark.slow
+def test_column_prints_the_line_that_all_codes_print() -> None:
+    command = [sys.executable, "-m", "benchmarks.column", "--n", "4", "--tend", "0.05", "--kernels", "xla"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=240)
+    assert done.returncode == 0, done.stderr
+    record = json.loads(done.stdout)
+    assert record["grains"] == 8 * 4**3
+    assert record["Mpss_cpu"] == pytest.approx(record["grains"] * record["substeps"] / record["cpu"] / 1e6, rel=0.01)
+    assert record["zcom"] < 0.1 and record["r99"] > 0.1 * math.sqrt(2) * 0.8
