@@ -57,6 +57,12 @@ template <class S, int D, class L> void gather(const ToGrains& t, int64_t b, int
   Pack<S> node[ROWS], sums[16];
   for (auto& a : node) a = Pack<S>(S(0));
   for (int64_t p = from; p < to; p += W) {
+    Bits<S> here = Pack<S>::load(m + p) > S(0);
+    if (!any(here)) {  // slots without grains, which left or never were
+      for (int i = 0; i < D; ++i) Pack<S>(S(0)).store(v + i * n + p);
+      for (int i = 0; i < D * D; ++i) Pack<S>(S(0)).store(C + i * n + p);
+      continue;
+    }
     cells<S, D>(x + p, n, per_cell, g, cell);
     look<S, D>(x + p, n, per_cell, g, win);
     for (int l = 0; l < W; ++l) {
@@ -95,7 +101,6 @@ template <class S, int D, class L> void gather(const ToGrains& t, int64_t b, int
       else sums[l] = group_sums(V, w * X, Y, V * row.node);
     }
     transpose(sums);
-    Bits<S> here = Pack<S>::load(m + p) > S(0);
     for (int i = 0; i < D; ++i) {
       Pack<S> vi = select<S>(here, sums[i], Pack<S>(S(0)));
       for (int j = 0; j < D; ++j) {

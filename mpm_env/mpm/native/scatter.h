@@ -132,11 +132,17 @@ template <class S, int D> struct Scatter {
             (Pack<S>::load(r) + sum[i * per + j]).store(r);
           }
       for (auto& a : sum) a = Pack<S>(S(0));
+      now = EMPTY;
     };
     int32_t before = EMPTY;  // the cell of the slot before, ours or not: sums are cut there whoever works
     for (int64_t block = 0; block * BLOCK < t.grains; ++block) {
-      if (plan.last[block] < from - 2 || plan.first[block] >= to) { before = EMPTY; continue; }
+      if (plan.last[block] < from - 2 || plan.first[block] >= to) { flush(); before = EMPTY; continue; }
       for (int64_t p = block * BLOCK; p < std::min((block + 1) * BLOCK, t.grains); p += W) {
+        if (std::all_of(&plan.cell[p], &plan.cell[p] + W, [](int32_t c) { return c == EMPTY; })) {
+          flush();
+          before = EMPTY;
+          continue;
+        }
         records(p, record);
         look<S, D>(x + p, t.grains, S(1 / t.grid.cell_size), g, win);
         for (int l = 0; l < W; ++l) {

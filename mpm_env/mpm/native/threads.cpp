@@ -15,49 +15,55 @@ constexpr int SPINS = 20000;  // looks before a thread goes to sleep: about as l
 
 thread_local bool inside = false;  // this thread is running a task
 
+// A call is a round. Whoever is awake takes its tasks one by one; nobody waits for a thread that did not wake in time.
 struct Pool {
   const int size;
   const pid_t owner = getpid();
   std::mutex busy;
   std::atomic<uint32_t> round{0};
-  std::atomic<int> next{0}, working{0};
-  int count = 0;
-  const std::function<void(int)>* task = nullptr;
+  std::atomic<uint64_t> next{0};  // the round in the upper half, its next task in the lower: both change together
+  std::atomic<int> count{0}, done{0};
+  std::atomic<const std::function<void(int)>*> task{nullptr};
 
   explicit Pool(int size) : size(size) {
     for (int i = 1; i < size; ++i) std::thread([this] { wait_and_work(); }).detach();
   }
 
-  void work() {
+  void work(uint32_t mine) {
     inside = true;
-    for (int i; (i = next.fetch_add(1)) < count;) (*task)(i);
+    for (uint64_t at = next; uint32_t(at >> 32) == mine && int(uint32_t(at)) < count;)
+      if (next.compare_exchange_weak(at, at + 1)) {
+        (*task.load())(int(uint32_t(at)));
+        done.fetch_add(1);
+        at = next;
+      }
     inside = false;
   }
 
   void wait_and_work() {
     for (uint32_t seen = 0;;) {
-      for (int spin = 0; round.load() == seen && spin < SPINS; ++spin)
+      for (int spin = 0; round == seen && spin < SPINS; ++spin)
 #if defined(__x86_64__)
         __builtin_ia32_pause();
 #else
         ;
 #endif
-      while (round.load() == seen) round.wait(seen);
-      seen = round.load();
-      work();
-      working.fetch_sub(1);
+      round.wait(seen);
+      seen = round;
+      work(seen);
     }
   }
 
   void run(int tasks, const std::function<void(int)>& what) {
+    const uint32_t mine = round + 1;
+    done = 0;
     count = tasks;
     task = &what;
-    next = 0;
-    working = size - 1;
-    round.fetch_add(1);
+    next = uint64_t(mine) << 32;
+    round = mine;
     round.notify_all();
-    work();
-    while (working.load() > 0) {
+    work(mine);
+    while (done < tasks) {
     }
   }
 };
