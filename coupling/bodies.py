@@ -112,12 +112,17 @@ def _jointed(model: mujoco.MjModel, body: int) -> bool:
     return bool(model.body_treeid[body] >= 0)
 
 
-def start(b: Bodies, qpos: Array, qvel: Array, ctrl: Array, mocap: tuple[Array, Array]) -> Any:
-    """MJX data at qpos (nq,) with joint velocities qvel (nv,), controls ctrl (nu,) and mocap poses set."""
-    d = mjx.make_data(b.mjx_model)
-    d = d.replace(qpos=jnp.asarray(qpos, d.qpos.dtype), qvel=jnp.asarray(qvel, d.qvel.dtype))
-    d = d.replace(ctrl=jnp.asarray(ctrl, d.ctrl.dtype))
-    return refresh(b, place(d, *mocap))
+def start(b: Bodies, qpos: np.ndarray, qvel: np.ndarray, ctrl: np.ndarray, mocap: tuple[np.ndarray, np.ndarray]) -> Any:
+    """MJX data at qpos (nq,) with joint velocities qvel (nv,), controls ctrl (nu,) and mocap poses set; fresh.
+
+    C MuJoCo places the bodies: a program in which they start has nothing of it to compile.
+    """
+    d = mujoco.MjData(b.model)
+    d.qpos[:], d.qvel[:], d.ctrl[:] = qpos, qvel, ctrl
+    d.mocap_pos[:], d.mocap_quat[:] = mocap
+    for stage in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_comVel):
+        stage(b.model, d)
+    return mjx.put_data(b.model, d)
 
 
 def place(d: Any, position: Array, quaternion: Array) -> Any:
@@ -167,9 +172,10 @@ def _product(a: Array, b: Array) -> Array:
 
 
 def refresh(b: Bodies, d: Any) -> Any:
-    """Data whose poses, centres of mass and body velocities belong to its qpos and qvel.
+    """Fresh data: poses, centres of mass and body velocities belong to its qpos, qvel and mocap poses.
 
-    MJX leaves those of the step's start behind.
+    MJX leaves those of the step's start behind. `open_step` goes on from them, so whoever changes qpos or a mocap pose
+    by hand calls this.
     """
     if not b.steps:
         return _carried(b, d)
@@ -212,7 +218,7 @@ def _carried(b: Bodies, d: Any) -> Any:
 
 
 def open_step(b: Bodies, d: Any, prescribed: Array) -> tuple[Any, Stance]:
-    """Forward dynamics without grains, and the stance that the grains will meet.
+    """Forward dynamics without grains from fresh data d, and the stance that the grains will meet.
 
     prescribed (B, 6): twists of the coupled bodies that hang on mocap bodies, zero for others (see drift).
     """
@@ -221,11 +227,10 @@ def open_step(b: Bodies, d: Any, prescribed: Array) -> tuple[Any, Stance]:
         # The load of the last step stays in, so that rigid constraints answer it; then it is taken out of the predictor
         # again, since the exchange will find this step's load itself.
         load = d.qfrc_applied
-        d = mjx.forward(model, d)
+        d = _forward(model, d)
         M = _integrated_mass(b, d)
         acceleration = jnp.linalg.solve(M, d.qfrc_smooth + d.qfrc_constraint - load)
     else:
-        d = refresh(b, d)
         M, acceleration = jnp.zeros((0, 0), d.qpos.dtype), jnp.zeros((0,), d.qpos.dtype)
     bodies, geoms = np.asarray(b.bodies), np.asarray(b.geoms)
     centre_of_mass = d.xipos[bodies]
@@ -236,6 +241,40 @@ def open_step(b: Bodies, d: Any, prescribed: Array) -> tuple[Any, Stance]:
     else:
         J = jnp.zeros((len(bodies), 6, 0), d.qpos.dtype)
     return d, Stance(centre_of_mass, lever, d.geom_xmat[geoms], J, prescribed, M, acceleration)
+
+
+# What mjx.forward does after kinematics and com_pos, in its order: those two `refresh` has done, and they are half of
+# its compile time.
+AFTER_PLACING = (
+    mjx.camlight,
+    mjx.tendon,
+    mjx.crb,
+    mjx.tendon_armature,
+    mjx.factor_m,
+    mjx.collision,
+    mjx.make_constraint,
+    mjx.transmission,
+    mjx.sensor_pos,
+    mjx.fwd_velocity,
+    mjx.sensor_vel,
+    mjx.fwd_actuation,
+    mjx.fwd_acceleration,
+)
+
+
+def _forward(model: Any, d: Any) -> Any:
+    """mjx.forward of fresh data."""
+    for stage in AFTER_PLACING:
+        d = stage(model, d)
+    d = _constrained(model, d)
+    return mjx.sensor_acc(model, d)
+
+
+def _constrained(model: Any, d: Any) -> Any:
+    """Data with the acceleration under rigid constraints, if there are any."""
+    if d._impl.efc_J.size == 0:
+        return d.replace(qacc=d.qacc_smooth)
+    return mjx.solve(model, d)
 
 
 def _integrated_mass(b: Bodies, d: Any) -> Array:
@@ -261,10 +300,7 @@ def close_step(b: Bodies, d: Any, impulse: Array) -> Any:
         return d.replace(time=d.time + b.model.opt.timestep)
     model = b.mjx_model
     d = mjx.fwd_acceleration(model, d.replace(qfrc_applied=impulse / b.model.opt.timestep))
-    if d._impl.efc_J.size == 0:
-        d = d.replace(qacc=d.qacc_smooth)
-    else:
-        d = mjx.solve(model, d)
+    d = _constrained(model, d)
     step = mjx.implicit if model.opt.integrator == IntegratorType.IMPLICITFAST else mjx.euler
     return step(model, d)
 
@@ -319,7 +355,7 @@ def points_near(
         if middle is not None:
             axes[1] = np.asarray([middle])
         x = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-        phi = np.asarray(_distances(shapes, jnp.asarray(x, jnp.float32), jnp.asarray(pos), jnp.asarray(mat)))
+        phi = np.asarray(_distances(shapes, jnp.asarray(x.T, jnp.float32), jnp.asarray(pos), jnp.asarray(mat)))
         per_point = 8 if middle is None else 4
         total += [-(-np.count_nonzero((phi > low) & (phi < top)) // per_point) for low, top in bands]
     return tuple(int(n) for n in total)
@@ -327,4 +363,4 @@ def points_near(
 
 @partial(jax.jit, static_argnums=0)
 def _distances(shapes: tuple[Shape, ...], x: Array, pos: Array, mat: Array) -> Array:
-    return distances(shapes, x, pos, mat)[0]
+    return distances(shapes, x, pos, mat)

@@ -1,8 +1,11 @@
-"""Points against rigid geoms: who is near, and the law of an inelastic contact with Coulomb friction."""
+"""Points against rigid geoms: who is near, and the law of an inelastic contact with Coulomb friction.
+
+Many points are rows (3, K): with their axis last they are computed side by side.
+"""
 
 from __future__ import annotations
 
-from functools import partial
+import functools
 from typing import NamedTuple
 
 import jax
@@ -10,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from coupling.geoms import Shape, distance_and_normal
+from coupling.geoms import Shape, distance, distance_and_normal, dot, once
 
 TINY = 1e-20  # (m/s)^2, guards the direction of sliding at rest
 
@@ -18,74 +21,102 @@ TINY = 1e-20  # (m/s)^2, guards the direction of sliding at rest
 class Points(NamedTuple):
     """Grid nodes or grains near bodies, each facing its nearest geom."""
 
-    x: Array  # (K, 3) m
-    v: Array  # (K, 3) m/s
+    x: Array  # (3, K) m
+    v: Array  # (3, K) m/s
     m: Array  # (K,) kg; 0 where the point takes no part
     phi: Array  # (K,) m, signed distance to the nearest geom
-    n: Array  # (K, 3) outward normal of that geom
+    n: Array  # (3, K) outward normal of that geom
     geom: Array  # (K,) its index among the coupled geoms
 
 
-def distances(shapes: tuple[Shape, ...], x: Array, pos: Array, mat: Array) -> tuple[Array, Array, Array]:
-    """Signed distance (K,) m, outward normal (K, 3) and index (K,) of the geom nearest to points x (K, 3) m.
+def distances(shapes: tuple[Shape, ...], x: Array, pos: Array, mat: Array) -> Array:
+    """Signed distance (K,) m of points x (3, K) m to the nearest geom; arguments as for `nearest_geom`."""
+    return functools.reduce(jnp.minimum, (jnp.min(some.distances(x), axis=0) for some in _alike(shapes, pos, mat)))
 
-    Geoms stand at pos (G, 3) m with axes mat (G, 3, 3), columns in world coordinates. Geoms of one kind are computed
-    together, so that a bucket of many plates compiles as one.
+
+def nearest_geom(shapes: tuple[Shape, ...], x: Array, pos: Array, mat: Array) -> tuple[Array, Array, Array]:
+    """Signed distance (K,) m, outward normal (3, K) and index (K,) of the geom nearest to points x (3, K) m.
+
+    Geoms stand at pos (G, 3) m with axes mat (G, 3, 3), columns in world coordinates.
     """
 
-    def one(shape: Shape, at: Array, axes: Array) -> tuple[Array, Array]:
-        phi, n = jax.vmap(partial(distance_and_normal, shape))((x - at) @ axes)
-        return phi, n @ axes.T
+    def nearer(a: tuple[Array, Array, Array], b: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        return jax.tree.map(functools.partial(jnp.where, b[0] < a[0]), b, a)
 
-    order: list[int] = []
-    phis, normals = [], []
-    for kind in dict.fromkeys(shape.kind for shape in shapes):
-        mine = [i for i, shape in enumerate(shapes) if shape.kind == kind]
-        order += mine
-        if shapes[mine[0]].voxels is not None:
-            both = [one(shapes[i], pos[i], mat[i]) for i in mine]
-            phis.append(jnp.stack([phi for phi, _ in both]))
-            normals.append(jnp.stack([n for _, n in both]))
-            continue
-        index = np.asarray(mine)
-        sizes = jnp.asarray([shapes[i].size for i in mine], x.dtype)
-        phi, n = jax.vmap(lambda size, at, axes, kind=kind: one(Shape(kind, size), at, axes))(
-            sizes, pos[index], mat[index]
-        )
-        phis.append(phi)
-        normals.append(n)
-    phi, normal = jnp.concatenate(phis), jnp.concatenate(normals)
-    nearest = jnp.argmin(phi, axis=0)
-    n = jnp.take_along_axis(normal, nearest[None, :, None], axis=0)[0]
-    return jnp.min(phi, axis=0), n, jnp.asarray(order, jnp.int32)[nearest]
+    return functools.reduce(nearer, (some.nearest(x) for some in _alike(shapes, pos, mat)))
+
+
+class Alike(NamedTuple):
+    """Some geoms of one kind, computed together so that a bucket of many plates compiles as one; or one mesh."""
+
+    shape: Shape  # of the first
+    among: np.ndarray  # (g,) indices of the coupled geoms
+    size: Array  # (3, g) m
+    at: Array  # (3, g) m
+    axes: Array  # (3, 3, g), columns in world coordinates
+
+    def distances(self, x: Array) -> Array:
+        """Signed distances (g, K) m of points x (3, K) m."""
+        size, at, axes = self.size[..., None], self.at[..., None], self.axes[..., None]
+        return distance(self.shape, _inward(axes, x[:, None] - at), size)
+
+    def nearest(self, x: Array) -> tuple[Array, Array, Array]:
+        """Signed distance (K,) m, outward normal (3, K) and index (K,) of the one nearest to points x (3, K) m."""
+        phi = once(self.distances(x))
+        g = jnp.argmin(phi, axis=0)
+        size, at, axes = once((self.size[:, g], self.at[:, g], self.axes[..., g]))
+        n = distance_and_normal(self.shape, once(_inward(axes, x - at)), size)[1]
+        return jnp.min(phi, axis=0), _outward(axes, once(n)), jnp.asarray(self.among, jnp.int32)[g]
+
+
+def _alike(shapes: tuple[Shape, ...], pos: Array, mat: Array) -> list[Alike]:
+    """The geoms by kind; every mesh on its own."""
+    kinds = [shape.kind if shape.voxels is None else -1 - i for i, shape in enumerate(shapes)]
+    out = []
+    for kind in dict.fromkeys(kinds):
+        mine = [i for i, other in enumerate(kinds) if other == kind]
+        among, size = np.asarray(mine), jnp.asarray([shapes[i].size for i in mine], pos.dtype).T
+        out.append(Alike(shapes[mine[0]], among, size, pos[among].T, jnp.moveaxis(mat[among], 0, -1)))
+    return out
+
+
+def _inward(axes: Array, v: Array) -> Array:
+    """World vectors v (3, ..) in a frame with these axes (3, 3, ..), columns in world coordinates."""
+    return jnp.stack([dot(axes[:, i], v) for i in range(3)])
+
+
+def _outward(axes: Array, v: Array) -> Array:
+    """Vectors v (3, ..) of a frame with these axes (3, 3, ..) in the world."""
+    return jnp.stack([dot(axes[i], v) for i in range(3)])
+
+
+def cross(a: Array, b: Array) -> Array:
+    """Vector products (3, ..), row by row."""
+    return jnp.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
 def impulses(p: Points, w: Array, mu: Array) -> Array:
-    """Impulses (K, 3) N s on points that move with w (K, 3) m/s relative to their body, friction mu (K,).
+    """Impulses (3, .., K) N s on points that move with w (3, .., K) m/s relative to their body, friction mu (K,).
 
     A point that separates gets none. One that approaches loses its approach and, by Coulomb's bound on the tangential
     impulse, all or part of its sliding.
     """
-    approach = jnp.maximum(-jnp.sum(w * p.n, axis=-1), 0)
-    w_t = w + approach[:, None] * p.n
-    speed = jnp.sqrt(jnp.sum(w_t * w_t, axis=-1) + TINY)
-    held = jnp.minimum(1, mu * approach / speed)
+    approach = jnp.maximum(-dot(w, p.n), 0)
+    w_t = [a + approach * n for a, n in zip(w, p.n, strict=True)]
+    held = jnp.minimum(1, mu * approach / jnp.sqrt(dot(w_t, w_t) + TINY))
     touching = jnp.where(approach > 0, p.m, 0)
-    return touching[:, None] * (approach[:, None] * p.n - held[:, None] * w_t)
+    push, hold = once((touching * (1 - held) * approach, touching * held))
+    return jnp.stack([push * n - hold * a for a, n in zip(w, p.n, strict=True)])
 
 
 def stiffness(p: Points, w: Array, mu: Array) -> Array:
-    """Derivative (K, 3, 3) kg of minus the impulses with respect to w: what one more m/s of approach would cost."""
-    approach = jnp.maximum(-jnp.sum(w * p.n, axis=-1), 0)
-    w_t = w + approach[:, None] * p.n
-    speed = jnp.sqrt(jnp.sum(w_t * w_t, axis=-1) + TINY)
+    """Derivative (3, 3, K) kg of minus the impulses with respect to w: what one more m/s of approach would cost."""
+    approach = jnp.maximum(-dot(w, p.n), 0)
+    w_t = w + approach * p.n
+    speed = jnp.sqrt(dot(w_t, w_t) + TINY)
     ratio = mu * approach / speed
-    sticks = ratio >= 1
-    t = w_t / speed[:, None]
-    eye = jnp.eye(3, dtype=w.dtype)
-    nn = p.n[:, :, None] * p.n[:, None, :]
-    tt = t[:, :, None] * t[:, None, :]
-    tn = t[:, :, None] * p.n[:, None, :]
-    slide = nn - mu[:, None, None] * tn + ratio[:, None, None] * (eye - nn - tt)
-    D = jnp.where(sticks[:, None, None], eye, slide)
-    return jnp.where(approach > 0, p.m, 0)[:, None, None] * D
+    t = w_t / speed
+    eye = jnp.eye(3, dtype=w.dtype)[..., None]
+    nn, tt, tn = p.n[:, None] * p.n, t[:, None] * t, t[:, None] * p.n
+    slide = nn - mu * tn + ratio * (eye - nn - tt)
+    return jnp.where(approach > 0, p.m, 0) * jnp.where(ratio >= 1, eye, slide)

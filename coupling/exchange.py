@@ -20,9 +20,11 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from coupling.contact import Points, impulses, stiffness
+from coupling.contact import Points, cross, impulses, stiffness
+from coupling.geoms import dot, once
 
 STEPS = (1.0, 0.5, 0.25, 0.0625)  # line search candidates: full Newton steps where they help, small ones at kinks
+SOLVED = 4.0  # times rounding: an equation with no larger share left is not iterated any further
 NOISE = 1e-6  # share of the points' kinetic energy below which work is rounding, and not scaled
 
 
@@ -39,7 +41,7 @@ class Exchange(NamedTuple):
     """What contact did."""
 
     q: Array  # (nv,) joint velocities after contact
-    impulse: Array  # (K, 3) N s on the points
+    impulse: Array  # (3, K) N s on the points
     wrench: Array  # (G, 6) impulse wrench on each geom about its body's centre: N s and N m s
     residual: Array  # () share of the equation left unsolved, 0 when converged
     scale: Array  # () factor that kept the impulses dissipative, 1 when converged
@@ -53,66 +55,84 @@ def exchange(p: Points, t: Twists, q_free: Array, mu: Array, body_of: tuple[int,
     """
     body = jnp.asarray(body_of, jnp.int32)[p.geom]
     friction = mu[p.geom]
-    r = p.x - t.centre[body]
-    prescribed = t.d[body]
-    drift = prescribed[:, :3] + jnp.cross(prescribed[:, 3:], r)
-    if t.M.shape[0] == 0:
-        f = impulses(p, p.v - drift, friction)
+    r = p.x - t.centre.T[:, body]
+    w = p.v - _at(t.d.T[:, body], r)
+    nv = t.M.shape[0]
+    if nv == 0:
+        f = impulses(p, w, friction)
         zero = jnp.zeros((), p.v.dtype)
         return Exchange(q_free, f, _per_geom(f, p, r, len(body_of)), zero, zero + 1)
-    # How the body's points under the grid points move with q: (K, 3, nv), and flat as (3K, nv).
-    J = t.J[body]
-    lever = (J[:, :3] + jnp.cross(J[:, 3:], r[:, :, None], axis=1)).reshape(-1, t.M.shape[0])
+    # How the body's points under the grid points move with q: (3, nv, K).
+    lever = _at(jnp.moveaxis(t.J, 0, -1)[..., body], r[:, None])
 
-    w_free = p.v - drift - (lever @ q_free).reshape(-1, 3)
-
-    # The unknown is the change of q, not q: a heavy body's would drown in the rounding of q.
-    def relative(change: Array) -> Array:
-        return w_free - (lever @ change).reshape(-1, 3)
+    def moved(q: Array) -> Array:
+        """Velocities (3, K) of the bodies' points with joint velocities q (nv,)."""
+        return dot(q, [lever[:, j] for j in range(nv)])
 
     def pull(f: Array) -> Array:
-        """Generalised impulse (nv,) of impulses f (K, 3) on the bodies."""
-        return f.reshape(-1) @ lever
+        """Generalised impulses (n, nv) of n times impulses f (3, n, K) on the bodies."""
+        return jnp.sum(jnp.einsum("cik,cjk->cij", f, lever), axis=0)
 
-    def added_mass(D: Array) -> Array:
-        """What points that answer with D (K, 3, 3) kg add to the bodies' inertia, (nv, nv)."""
-        return lever.T @ (D @ lever.reshape(-1, 3, t.M.shape[0])).reshape(lever.shape)
+    # The unknown is the change of q, not q: a heavy body's would drown in the rounding of q.
+    w_free = w - moved(q_free)
+    metric = jnp.linalg.inv(t.M + pull(p.m * lever))
 
-    metric = jnp.linalg.inv(t.M + lever.T @ (jnp.repeat(p.m, 3)[:, None] * lever))
+    def best(changes: Array, w: Array) -> Newton:
+        """The best of n changes (n, nv), with which points move with w (3, n, K) relative to their body."""
+        R = changes @ t.M.T + pull(impulses(p, w, friction))
+        size = jnp.sqrt(jnp.maximum(jnp.sum((R @ metric) * R, axis=-1), 0))
+        i = jnp.argmin(size)
+        return Newton(changes[i], w[:, i], R[i], size[i], jnp.ones((), bool))
 
-    def residual(change: Array) -> Array:
-        return t.M @ change + pull(impulses(p, relative(change), friction))
+    none = best(jnp.zeros_like(q_free)[None], w_free[:, None])
+    enough = SOLVED * jnp.finfo(none.size.dtype).eps * none.size
 
-    def size(R: Array) -> Array:
-        return jnp.sqrt(jnp.maximum(R @ metric @ R, 0))
+    def nearer(old: Newton, step: Array, shares: Array) -> Newton:
+        """After the best of some shares (n,) of a step (nv,), if it helps at all."""
+        w = old.w[:, None] - shares[:, None] * once(moved(step))[:, None]
+        new = best(old.change + shares[:, None] * step, w)
+        helps = new.size < old.size
+        new = jax.tree.map(lambda a, b: jnp.where(helps, a, b), new, old)
+        return new._replace(going=helps & (new.size > enough))
 
-    none, stuck = jnp.zeros_like(q_free), metric @ pull(p.m[:, None] * w_free)
-    start = size(residual(none))
-    change = jnp.where(size(residual(stuck)) < start, stuck, none)
-    steps = jnp.asarray(STEPS, q_free.dtype)
+    def newton(_: int, at: Newton) -> Newton:
+        D = stiffness(p, at.w, friction)
+        H = t.M + pull(jnp.stack([dot(row[:, None], lever) for row in D])).T
+        return nearer(at, -jnp.linalg.solve(H, at.R), jnp.asarray(STEPS, at.R.dtype))
 
-    def newton(_: int, change: Array) -> Array:
-        H = t.M + added_mass(stiffness(p, relative(change), friction))
-        step = -jnp.linalg.solve(H, residual(change))
-        tries = change + steps[:, None] * step
-        sizes = jax.vmap(lambda trial: size(residual(trial)))(tries)
-        best = jnp.argmin(sizes)
-        return jnp.where(sizes[best] < size(residual(change)), tries[best], change)
-
-    change = jax.lax.fori_loop(0, iterations, newton, change)
-    f = impulses(p, relative(change), friction)
-    push = jnp.linalg.solve(t.M, pull(f))  # what the bodies give: q = q_free - push
+    stuck = metric @ pull((p.m * w_free)[:, None])[0]
+    at = nearer(none, stuck, jnp.ones((1,), stuck.dtype))
+    at = at._replace(going=at.size > enough)
+    at = jax.lax.fori_loop(0, iterations, lambda i, at: jax.lax.cond(at.going, newton, lambda _, at: at, i, at), at)
+    f = impulses(p, at.w, friction)
+    pulled = pull(f[:, None])[0]
+    push = jnp.linalg.solve(t.M, pulled)  # what the bodies give: q = q_free - push
     work = jnp.sum(f * w_free)
-    doubled = jnp.sum(jnp.sum(f * f, axis=-1) / jnp.where(p.m > 0, p.m, 1)) + pull(f) @ push
-    noise = NOISE * jnp.sum(p.m * jnp.sum(p.v * p.v, axis=-1))
+    doubled = jnp.sum(dot(f, f) / jnp.where(p.m > 0, p.m, 1)) + pulled @ push
+    noise = NOISE * jnp.sum(p.m * dot(p.v, p.v))
     noticeable = jnp.abs(work) > noise
-    left = jnp.where(start * start > noise, size(residual(change)) / jnp.maximum(start, jnp.finfo(start.dtype).tiny), 0)
+    left = jnp.where(none.size**2 > noise, at.size / jnp.maximum(none.size, jnp.finfo(w.dtype).tiny), 0)
     scale = jnp.where(noticeable & (doubled > 0), jnp.clip(-work / jnp.where(doubled > 0, doubled, 1), 0, 1), 1)
     f = scale * f
     return Exchange(q_free - scale * push, f, _per_geom(f, p, r, len(body_of)), left, scale)
 
 
+class Newton(NamedTuple):
+    """Where the iteration stands."""
+
+    change: Array  # (nv,) of q by contact
+    w: Array  # (3, K) m/s, how points then move relative to their bodies
+    R: Array  # (nv,) what is left of the equation there
+    size: Array  # () of R
+    going: Array  # () bool, whether another step can help
+
+
+def _at(twist: Array, r: Array) -> Array:
+    """Velocities (3, ..) at r (3, ..) m of bodies with twists (6, ..)."""
+    return twist[:3] + cross(twist[3:], r)
+
+
 def _per_geom(f: Array, p: Points, r: Array, count: int) -> Array:
-    """Impulse wrench (G, 6) on each geom: the reaction of the impulses f (K, 3) on its points."""
-    onto = (p.geom[:, None] == jnp.arange(count)).astype(f.dtype)
-    return -onto.T @ jnp.concatenate([f, jnp.cross(r, f)], axis=-1)
+    """Impulse wrench (G, 6) on each geom: the reaction of the impulses f (3, K) on its points."""
+    onto = (p.geom == jnp.arange(count)[:, None]).astype(f.dtype)
+    return -onto @ jnp.concatenate([f, cross(r, f)]).T

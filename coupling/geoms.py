@@ -1,10 +1,11 @@
 """How far a point is from a MuJoCo geom: signed distance in metres, negative inside, in the geom's own frame.
 
-Primitive shapes have exact distances, one function each in `GEOM_SDF`. A mesh, concave or not, is turned once
+Primitive shapes have exact distances, one function each in `GEOM_SDF`, written on the rows x, y, z of one point (3,) or
+of many (3, ..): with the points' axis last they are computed side by side. A mesh, concave or not, is turned once
 into a grid of distances (voxels), kept on disk and sampled linearly. MuJoCo itself collides a mesh as its
 convex hull, so a concave tool that must also touch rigid bodies is better built from boxes.
 
-To add a primitive: write its distance for one point, then add one line to `GEOM_SDF` and one to `BOUNDS`.
+To add a primitive: write its distance, then add one line to `GEOM_SDF` and one to `BOUNDS`.
 """
 
 import functools
@@ -14,9 +15,10 @@ import os
 import tempfile
 import warnings
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -44,6 +46,9 @@ FLAT_GRADIENT = 1e-6
 """A squared gradient below this has no direction left: exact distances have 1, voxels 0 on ridges inside."""
 
 
+Rows = Array | Sequence[Array]
+
+
 @dataclass(frozen=True, eq=False)
 class Voxels:
     """Signed distances to a mesh at the nodes of a grid of cubes, in the geom's frame."""
@@ -62,12 +67,22 @@ class Shape:
     voxels: Voxels | None = None  # meshes only
 
 
-def length(v: Array) -> Array:
-    """Euclidean length () whose gradient is a unit vector even at zero (there: along the first axis).
+def dot(a: Rows, b: Rows) -> Array:
+    """Inner products (..) of vectors (n, ..), row by row: a reduction of the first axis is not vectorised."""
+    return functools.reduce(lambda s, t: s + t, (p * q for p, q in zip(a, b, strict=True)))
+
+
+def once(a: Any) -> Any:
+    """Arrays as they are, but computed once: XLA likes to compute them anew in every loop that reads them."""
+    return jax.lax.optimization_barrier(a)
+
+
+def length(v: Rows) -> Array:
+    """Euclidean lengths (..) of v (n, ..), whose gradient is a unit vector even at zero (there: along the first axis).
 
     The first axis is at right angles to every geom's axis of symmetry, z, so it is a true normal there too.
     """
-    square = jnp.sum(v * v)
+    square = dot(v, v)
     far = square > TINY_SQUARE
     return jnp.where(far, jnp.sqrt(jnp.where(far, square, 1)), v[0])
 
@@ -77,11 +92,11 @@ def magnitude(v: Array) -> Array:
     return jnp.where(v < 0, -v, v)
 
 
-def corner(q: Array) -> Array:
-    """Signed distance () to the region where all of q <= 0: boxes and cylinders, seen from one corner."""
+def corner(q: Rows) -> Array:
+    """Signed distances (..) to the region where all of q (n, ..) <= 0: boxes and cylinders, seen from one corner."""
     # Not jnp.max, which shares the gradient among equals and so shortens it.
     nearest = functools.reduce(lambda a, b: jnp.where(b > a, b, a), q)
-    return jnp.where(nearest > 0, length(jnp.maximum(q, 0)), nearest)
+    return jnp.where(nearest > 0, length([jnp.maximum(a, 0) for a in q]), nearest)
 
 
 def plane(size: Array, p: Array) -> Array:
@@ -96,17 +111,17 @@ def sphere(size: Array, p: Array) -> Array:
 
 def capsule(size: Array, p: Array) -> Array:
     """Capsule of radius size[0] around the segment |z| <= size[1]."""
-    return length(p.at[2].add(-jnp.clip(p[2], -size[1], size[1]))) - size[0]
+    return length((p[0], p[1], p[2] - jnp.clip(p[2], -size[1], size[1]))) - size[0]
 
 
 def cylinder(size: Array, p: Array) -> Array:
     """Cylinder of radius size[0] and half height size[1], along z."""
-    return corner(jnp.stack([length(p[:2]) - size[0], magnitude(p[2]) - size[1]]))
+    return corner((length(p[:2]) - size[0], magnitude(p[2]) - size[1]))
 
 
 def box(size: Array, p: Array) -> Array:
     """Box of half sides size."""
-    return corner(magnitude(p) - size)
+    return corner([magnitude(a) - half for a, half in zip(p, size, strict=True)])
 
 
 def ellipsoid(size: Array, p: Array) -> Array:
@@ -118,24 +133,24 @@ def ellipsoid(size: Array, p: Array) -> Array:
     error is second order in that of x. Gradients by p and by size are exact; second derivatives are left out.
     """
     r, a = jax.lax.stop_gradient((size, magnitude(p)))
-    r_min = jnp.min(r)
+    r_min = jnp.min(r, axis=0)
     rp = r * jnp.maximum(a, NUDGE * r_min)
     gap = (r - r_min) * (r + r_min)
 
-    low, high = jnp.max(rp - gap), jnp.linalg.norm(rp)  # not 0, by NUDGE; |u| >= 1 at low, <= 1 at high
+    low, high = jnp.max(rp - gap, axis=0), jnp.sqrt(dot(rp, rp))  # not 0, by NUDGE; |u| >= 1 at low, <= 1 at high
     for _ in range(HALVINGS):
         middle = jnp.sqrt(low * high)
-        below = jnp.sum((rp / (middle + gap)) ** 2) > 1
+        below = jnp.sum((rp / (middle + gap)) ** 2, axis=0) > 1
         low, high = jnp.where(below, middle, low), jnp.where(below, high, middle)
     s = low  # |u|^2 falls and is convex, so Newton from below never oversteps
     for _ in range(NEWTON_STEPS):
         u_square = (rp / (s + gap)) ** 2
-        s = s + (jnp.sum(u_square) - 1) / jnp.sum(2 * u_square / (s + gap))
+        s = s + (jnp.sum(u_square, axis=0) - 1) / jnp.sum(2 * u_square / (s + gap), axis=0)
 
     u = jnp.where(p < 0, -1, 1) * rp / (s + gap)
     u = jax.lax.stop_gradient(u / length(u))
     n = jax.lax.stop_gradient(u / r / length(u / r))
-    return jnp.sum(n * (p - size * u))
+    return dot(n, p - size * u)
 
 
 def mesh(voxels: Voxels, p: Array) -> Array:
@@ -146,8 +161,8 @@ def mesh(voxels: Voxels, p: Array) -> Array:
     but for that error, never below the true distance.
     """
     values = jnp.asarray(voxels.values, p.dtype)
-    origin = jnp.asarray(voxels.origin, p.dtype)
-    at = jnp.clip(p, origin, origin + voxels.spacing * (np.array(values.shape, p.dtype) - 1))
+    origin, last = _beside(voxels.origin, p), _beside(np.array(values.shape) - 1, p)
+    at = jnp.clip(p, origin, origin + voxels.spacing * last)
     sampled = map_coordinates(values, list((at - origin) / voxels.spacing), order=1, mode="nearest")
     return sampled + length(p - at)
 
@@ -160,7 +175,7 @@ GEOM_SDF: dict[int, Callable[[Array, Array], Array]] = {
     int(mujoco.mjtGeom.mjGEOM_CYLINDER): cylinder,
     int(mujoco.mjtGeom.mjGEOM_BOX): box,
 }
-"""Signed distance () m of one point p (3,) from a primitive of MuJoCo's size (3,), in the geom's frame."""
+"""Signed distances (..) m of points p (3, ..) from a primitive of MuJoCo's size (3, ..), in the geom's frame."""
 
 BOUNDS: dict[int, Callable[[float, float, float], tuple[tuple[float, float, float], float]]] = {
     int(mujoco.mjtGeom.mjGEOM_PLANE): lambda a, b, c: ((math.inf, math.inf, math.inf), math.inf),
@@ -173,23 +188,32 @@ BOUNDS: dict[int, Callable[[float, float, float], tuple[tuple[float, float, floa
 """Half sides of a primitive's bounding box and radius of its bounding sphere, m, from MuJoCo's size."""
 
 
-def distance(shape: Shape, p: Array) -> Array:
-    """Signed distance () m of one point p (3,) m of the geom's frame; negative inside. In p's precision."""
+def distance(shape: Shape, p: Array, size: Array | None = None) -> Array:
+    """Signed distances (..) m of points p (3, ..) m of the geom's frame; negative inside. In p's precision.
+
+    With a size (3, ..) m for each point, each is measured from a geom of its own, of the same kind.
+    """
     if shape.voxels is not None:
         return mesh(shape.voxels, p)
-    return GEOM_SDF[shape.kind](jnp.asarray(shape.size, p.dtype), p)
+    return GEOM_SDF[shape.kind](_beside(shape.size, p) if size is None else size, p)
 
 
-def distance_and_normal(shape: Shape, p: Array) -> tuple[Array, Array]:
-    """Signed distance () m of one point p (3,) m and the outward unit normal (3,), in the geom's frame.
+def distance_and_normal(shape: Shape, p: Array, size: Array | None = None) -> tuple[Array, Array]:
+    """Signed distances (..) m of points p (3, ..) m and the outward unit normals (3, ..), in the geom's frame.
 
     The normal is that of the nearest surface point, inside too, or of one of several equally near. On ridges
     inside a mesh it may be any unit vector.
     """
-    phi, gradient = jax.value_and_grad(functools.partial(distance, shape))(p)
-    steep = jnp.sum(gradient * gradient) > FLAT_GRADIENT
-    gradient = jnp.where(steep, gradient, jnp.array([1, 0, 0], p.dtype))
+    phi, back = jax.vjp(lambda p: distance(shape, p, size), p)
+    gradient = once(back(jnp.ones_like(phi))[0])  # each distance depends on its own point only
+    steep = dot(gradient, gradient) > FLAT_GRADIENT
+    gradient = jnp.where(steep, gradient, _beside((1, 0, 0), p))
     return phi, gradient / length(gradient)
+
+
+def _beside(a: Sequence[float] | np.ndarray, p: Array) -> Array:
+    """a (3,) in the precision of points p (3, ..), with axes added so that the two go together."""
+    return jnp.asarray(a, p.dtype).reshape((3,) + (1,) * (p.ndim - 1))
 
 
 def half_extents(shape: Shape) -> np.ndarray:

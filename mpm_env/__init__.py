@@ -6,7 +6,8 @@
     run.run, demo.demo           a scene, or a task's script, to a folder of results
     make_task                    a task; tasks.reset(task, key) and tasks.step(task, episode, action) are pure
 
-Importing registers the Gymnasium environments mpm_env/DigSand-v0, DigSnow-v0, PushSand-v0 and PushSnow-v0.
+Importing registers the Gymnasium environments mpm_env/DigSand-v0, DigSnow-v0, PushSand-v0 and PushSnow-v0. Building a
+scene has JAX keep compiled programs in ~/.cache/mpm_env, unless you decide otherwise: see `scene_cache.keep_programs`.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import gymnasium
 
 # XLA hands the many small kernels of a substep to a pool of threads and loses more than it gains: on two cores the same
 # run takes 1.7 times as long. JAX reads this when it starts its CPU client; set NPROC yourself to decide otherwise.
+# Compiling still uses all cores.
 os.environ.setdefault("NPROC", "1")
 
 # Loaded when first asked for, so that `import mpm_env` stays light.

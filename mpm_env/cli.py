@@ -105,6 +105,7 @@ def report(summary: dict[str, Any]) -> Iterator[str]:
     yield f"{summary['scene']}: {figures['simulated_s']:.6g} s simulated, {summary['ended']}"
     cell_mm, dt_ms = 1000 * numerics["cell_size_m"], 1000 * numerics["mpm_dt_s"]
     yield f"{numerics['grains']} grains, cells of {cell_mm:.4g} mm, substeps of {dt_ms:.3g} ms"
+    yield f"kernels: {numerics['kernels']}"
     if figures["mass_start_kg"]:
         top = "" if figures["top_of_grains_m"] is None else f"; top at {figures['top_of_grains_m']:.4g} m"
         yield (
@@ -214,7 +215,8 @@ def _demo(options: argparse.Namespace) -> int:
     print(", ".join(f"{k.removesuffix('_kg')} {v:.3g} kg" for k, v in facts.items() if k.endswith("_kg")))
     largest = summary["force_largest_mean_of_an_action_N"]
     print(f"force on the tool: mean {summary['force_mean_N']:.3g} N, largest mean of an action {largest:.3g} N")
-    print(f"{summary['grains']} grains; wall time {', '.join(f'{k} {v:.1f} s' for k, v in wall.items())}")
+    print(f"{summary['grains']} grains; kernels: {summary['versions']['kernels']}")
+    print(f"wall time {', '.join(f'{k} {v:.1f} s' for k, v in wall.items())}")
     for sentence in summary["health"]["sentences"]:
         print(f"warning: {sentence}")
     print(f"{options.out}: {', '.join(FILES)}")

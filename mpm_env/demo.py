@@ -118,7 +118,7 @@ class Demo:
             "wall_s": wall,
             "seed": self.seed,
             "fidelity": scene.fidelity.model_dump(mode="json"),
-            "versions": versions(),
+            "versions": versions(scene.kernels),
         }
         (self.out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
         return summary
@@ -136,7 +136,7 @@ def _recorder(env: GrainsEnv, path: Path, seed: int) -> Recorder:
         "key": env.key_number,
         "config": env.task.config.model_dump(mode="json"),
         "fidelity": scene.fidelity.model_dump(mode="json"),
-        "versions": versions(),
+        "versions": versions(scene.kernels),
     }
     return Recorder(
         path, recipe=recipe, model=scene.bodies.model, box=(box.lower, box.upper), view=(camera.eye, camera.target)

@@ -21,9 +21,9 @@ from mpm_env.view import View
 LARGEST = np.float32(1e6)  # bound of observations: far beyond any healthy value, and finite as check_env likes it
 
 
-def spaces(task: Task) -> tuple[gym.spaces.Dict, gym.spaces.Box]:
-    """Observation and action space of a task; the shapes come from tracing it, not from a second list."""
-    shapes = jax.eval_shape(partial(reset, task), jax.random.key(0)).observation
+def spaces(task: Task, start: Episode) -> tuple[gym.spaces.Dict, gym.spaces.Box]:
+    """Observation and action space of a task; the shapes are those of its episodes' start, not from a second list."""
+    shapes = start.observation
     observation = gym.spaces.Dict(
         {k: gym.spaces.Box(-LARGEST, LARGEST, v.shape, np.float32) for k, v in sorted(shapes.items())}
     )
@@ -49,7 +49,8 @@ class GrainsEnv(gym.Env[dict[str, np.ndarray], np.ndarray]):
     """One task. `info` holds the reward's terms, masses and lengths, the reason of a truncation, and health sentences.
 
     fidelity: a shipped name, a .yaml file or a Fidelity; None takes the task's own. The observation and the action are
-    described by the task's class (`env.unwrapped.task`).
+    described by the task's class (`env.unwrapped.task`). A step writes over the arrays of `episode` (they are donated):
+    to keep one, copy it, as in jax.tree.map(jnp.copy, env.unwrapped.episode).
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
@@ -60,10 +61,10 @@ class GrainsEnv(gym.Env[dict[str, np.ndarray], np.ndarray]):
         self.render_mode = _known_mode(render_mode)
         self.task = make_task(task, fidelity)
         self.metadata = {**type(self).metadata, "render_fps": round(1 / self.task.config.control_dt)}
-        observation_space, self._actions = spaces(self.task)
-        self.observation_space, self.action_space = observation_space, self._actions  # type: ignore[assignment]
         self._reset = jax.jit(partial(reset, self.task))
-        self._step = jax.jit(partial(step, self.task))
+        self._step = jax.jit(partial(step, self.task), donate_argnums=0)
+        observation_space, self._actions = spaces(self.task, self._reset.eval_shape(jax.random.key(0)))
+        self.observation_space, self.action_space = observation_space, self._actions  # type: ignore[assignment]
         self.episode: Episode | None = None  # what the last call left, for logs and for the curious
         self.key_number: int | None = None  # jax.random.key(key_number) made this episode's start
 
@@ -106,8 +107,8 @@ class GrainsEnv(gym.Env[dict[str, np.ndarray], np.ndarray]):
 class GrainsVectorEnv(gym.vector.VectorEnv[dict[str, np.ndarray], np.ndarray, np.ndarray]):
     """A batch of one task: one program runs the environments one after the other, each to the end of its action.
 
-    On a CPU that keeps one environment's grid in cache. An environment that
-    ended is reset by the next step, whose action it ignores (AutoresetMode.NEXT_STEP).
+    On a CPU that keeps one environment's grid in cache. An environment that ended is reset by the next step, whose
+    action it ignores (AutoresetMode.NEXT_STEP). A step writes over the arrays of `episodes`, as in GrainsEnv.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10, "autoreset_mode": AutoresetMode.NEXT_STEP}
@@ -129,10 +130,6 @@ class GrainsVectorEnv(gym.vector.VectorEnv[dict[str, np.ndarray], np.ndarray, np
         limit = actions_per_episode(self.task)
         if max_episode_steps not in (None, limit):
             raise ValueError(f"The task ends after {limit} steps, got max_episode_steps = {max_episode_steps}.")
-        self.single_observation_space, self.single_action_space = spaces(self.task)
-        self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, num_envs)
-        self.action_space = gym.vector.utils.batch_space(self.single_action_space, num_envs)
-        self.episodes: Episode | None = None
 
         def reset_all(keys: Array) -> Episode:
             return lax.map(partial(reset, self.task), keys)
@@ -145,7 +142,13 @@ class GrainsVectorEnv(gym.vector.VectorEnv[dict[str, np.ndarray], np.ndarray, np
 
             return lax.map(one, (episodes, actions, keys))
 
-        self._reset, self._step = jax.jit(reset_all), jax.jit(step_all)
+        self._reset, self._step = jax.jit(reset_all), jax.jit(step_all, donate_argnums=0)
+        start = self._reset.eval_shape(_keys_of([0] * num_envs))
+        one_start = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), start)
+        self.single_observation_space, self.single_action_space = spaces(self.task, one_start)
+        self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, num_envs)
+        self.action_space = gym.vector.utils.batch_space(self.single_action_space, num_envs)
+        self.episodes: Episode | None = None
 
     def reset(
         self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
@@ -185,7 +188,7 @@ class GrainsVectorEnv(gym.vector.VectorEnv[dict[str, np.ndarray], np.ndarray, np
     def _keys(self, wanted: np.ndarray) -> Array:
         """A fresh key for each environment that starts anew; the others' random streams stay where they are."""
         numbers = [int(r.integers(2**31 - 1)) if w else 0 for r, w in zip(self._randoms, wanted, strict=True)]
-        return jax.vmap(jax.random.key)(jnp.asarray(numbers, jnp.int32))
+        return _keys_of(numbers)
 
     def _info(self, e: Episode) -> dict[str, Any]:
         all_of = np.ones(self.num_envs, bool)
@@ -205,6 +208,10 @@ class GrainsVectorEnv(gym.vector.VectorEnv[dict[str, np.ndarray], np.ndarray, np
             )
             info["_truncated_because"] = ended
         return info
+
+
+def _keys_of(numbers: list[int]) -> Array:
+    return jax.vmap(jax.random.key)(jnp.asarray(numbers, jnp.int32))
 
 
 def _known_mode(render_mode: str | None) -> str | None:

@@ -27,7 +27,7 @@ class Fidelity(Section):
     )
     precision: Literal["f32", "f64"] = "f32"
     kernels: Literal["auto", "native", "xla"] = Field(
-        "auto", description="native C++ where it can be had, or plain XLA: the same to rounding, several times apart in speed"
+        "auto", description="native C++ where it can be had, or plain XLA: the same to rounding, far apart in speed"
     )
     contact_band: Annotated[float, Field(ge=0, le=1)] = Field(0.5, description="cells off a body where nodes feel it")
     contact_iterations: int = Field(4, ge=1, le=20, description="Newton iterations of the momentum exchange")

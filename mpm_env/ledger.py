@@ -66,12 +66,11 @@ class Ledger:
 
     def snapshot(self, state: State, view: View) -> None:
         """Keep every grain of a state: empty slots have no mass."""
-        scene = self.scene
+        scene, p = self.scene, state.grains_at_home
         x, v = (np.full((scene.slots, 3), np.nan, np.float32) for _ in range(2))
         x[view.slots] = view.grains
-        v[view.slots] = _in_space(np.asarray(state.grains.v), scene)[view.slots]
-        p = state.grains
-        row = {"time": view.time, "x": x, "v": v, "mass": np.asarray(p.m), "history": np.asarray(p.history)}
+        v[view.slots] = _in_space(np.asarray(p.v), scene)[view.slots]
+        row = {"time": view.time, "x": x, "v": v, "mass": p.m, "history": p.history}
         for key, value in row.items():
             self.snapshots.setdefault(f"snapshot_{key}", []).append(value)
 

@@ -15,6 +15,7 @@ from tqdm import tqdm
 from mpm_env.config import parse
 from mpm_env.fidelity import Fidelity
 from mpm_env.log import Recording
+from mpm_env.mpm import native
 from mpm_env.run import versions
 from mpm_env.scene import build, initial
 from mpm_env.scene_config import SceneConfig
@@ -54,11 +55,8 @@ def scene_frames(recording: Recording) -> Frames:
     """The frames of a scene, simulated again from its recipe."""
     entry = partial(_entry, recording.recipe)
     per_frame, seed = entry("steps_per_frame", int), entry("seed", int)
-    scene = build(
-        parse(SceneConfig, entry("config", dict), "the recorded scene"),
-        parse(Fidelity, entry("fidelity", dict), "the recorded fidelity"),
-    )
-    state = initial(scene, jax.random.key(seed))
+    scene = build(parse(SceneConfig, entry("config", dict), "the recorded scene"), _fidelity(recording.recipe))
+    state = jax.jit(partial(initial, scene))(jax.random.key(seed))  # as in a run: to the bit
     program = jax.jit(partial(advance, scene))
     yield 0, View.of(scene, state)
     for k in range(len(recording.steps) - 1):
@@ -70,10 +68,7 @@ def task_frames(recording: Recording) -> Frames:
     """The frames of an episode, simulated again from its recipe and its recorded actions."""
     entry = partial(_entry, recording.recipe)
     key = entry("key", int)
-    task = make_task(
-        parse(TaskConfig, entry("config", dict), "the recorded task"),
-        parse(Fidelity, entry("fidelity", dict), "the recorded fidelity"),
-    )
+    task = make_task(parse(TaskConfig, entry("config", dict), "the recorded task"), _fidelity(recording.recipe))
     count = len(recording.steps) - 1
     if recording.actions.shape != (len(recording.actions), task.rates.size) or len(recording.actions) < count:
         raise ValueError(
@@ -114,11 +109,19 @@ def compare(recording: Recording, *, progress: bool = True) -> Comparison:
             size = size if step_then == step_now else np.inf
             if size > worst[what].size:
                 worst[what] = Difference(size, int(step_then), float(time_then), where)
-    before, after = recording.recipe.get("versions", {}), versions()
+    before, after = recording.recipe.get("versions", {}), versions(native.chosen(_fidelity(recording.recipe).kernels))
     changed = {
         k: (before.get(k, "none"), after.get(k, "none")) for k in {**before, **after} if before.get(k) != after.get(k)
     }
     return Comparison(len(recording.steps), **worst, versions=changed)
+
+
+def _fidelity(recipe: dict[str, Any]) -> Fidelity:
+    """The recorded fidelity, without native kernels where this machine has none: they change the rounding only."""
+    fidelity = parse(Fidelity, _entry(recipe, "fidelity", dict), "the recorded fidelity")
+    if fidelity.kernels == "native" and native.why_not():
+        return fidelity.model_copy(update={"kernels": "auto"})
+    return fidelity
 
 
 def _entry(recipe: dict[str, Any], name: str, kind: type[T]) -> T:

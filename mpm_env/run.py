@@ -23,6 +23,7 @@ from mpm_env.fidelity import Fidelity
 from mpm_env.health import Health, names, sentences
 from mpm_env.ledger import Ledger
 from mpm_env.log import COLOUR_RANGES, Recorder
+from mpm_env.mpm import native
 from mpm_env.render import save_png
 from mpm_env.scene import Scene, State, build, initial
 from mpm_env.scene_config import SceneConfig
@@ -125,7 +126,7 @@ def prepare(
     if not 0 <= seed <= MOST_SEED:
         raise ValueError(f"seed = {seed} is outside 0..{MOST_SEED}: use a seed in that range.")
     camera = camera_of(scene)
-    state = initial(scene, jax.random.key(seed))
+    state = jax.jit(partial(initial, scene))(jax.random.key(seed))  # arrays of its own: the run writes over them
     with folder(out, FILES) as path:
         recorder = None
         if record:
@@ -187,14 +188,17 @@ class Session:
         """Run to the end; returns how it ended."""
         scene, per_frame = self.scene, self.rhythm.steps_per_frame
         started = perf_counter()
-        program = jax.jit(partial(advance, scene)).lower(self.state, scripted(scene, 0, per_frame)).compile()
+        stepping = jax.jit(partial(advance, scene), donate_argnums=0)
+        program = stepping.lower(self.state, scripted(scene, 0, per_frame)).compile()
         self.wall["compile"] = perf_counter() - started
         self._note(no_reactions(scene), keep=True)
         every = self.rhythm.frames_per_snapshot
         for k in tqdm(range(1, self.rhythm.frames + 1), unit="frame", disable=not progress):
             started = perf_counter()
             drives = scripted(scene, (k - 1) * per_frame, per_frame)
-            self.state, reactions = jax.block_until_ready(program(self.state, drives))
+            # First the new state, then the wait for it: Ctrl-C may come meanwhile, and the old one is written over.
+            self.state, reactions = program(self.state, drives)
+            jax.block_until_ready(self.state)
             self.wall["run"] += perf_counter() - started
             lost = bool(int(self.state.health) & Health.NOT_FINITE)
             last = lost or k == self.rhythm.frames
@@ -251,7 +255,7 @@ class Session:
                 "processor": platform.machine(),
                 "cores": os.cpu_count(),
             },
-            "versions": versions(),
+            "versions": versions(scene.kernels),
             "seed": self.seed,
             "config": scene.config.model_dump(mode="json"),
             "fidelity": scene.fidelity.model_dump(mode="json"),
@@ -281,6 +285,7 @@ class Session:
             "rigid_steps": steps,
             "grain_substeps_per_s": steps * scene.mpm_per_rigid * grains / seconds if seconds else None,
             "room_near_bodies": scene.sizes._asdict(),
+            "kernels": native.spoken(scene.kernels),
         }
 
 
@@ -296,17 +301,18 @@ def recipe(scene: Scene, *, seed: int, steps_per_frame: int) -> dict[str, Any]:
         "rigid_dt_s": scene.rigid_dt,
         "config": scene.config.model_dump(mode="json"),
         "fidelity": scene.fidelity.model_dump(mode="json"),
-        "versions": versions(),
+        "versions": versions(scene.kernels),
     }
 
 
-def versions() -> dict[str, str]:
-    """Versions of what decides the numbers."""
+def versions(kernels: str) -> dict[str, str]:
+    """Versions of what decides the numbers, the grains' kernels among them."""
     packages = {"jax": "jax", "mujoco": "mujoco", "mjx": "mujoco-mjx", "numpy": "numpy", "rerun": "rerun-sdk"}
     return {
         "python": platform.python_version(),
         **{k: version(v) for k, v in packages.items()},
         "mpm_env": _own_version(),
+        "kernels": native.spoken(kernels),
     }
 
 

@@ -15,22 +15,24 @@ import mujoco
 import numpy as np
 from jax import Array
 
-from coupling.bodies import Bodies, couple, points_near, start
-from coupling.contact import distances
+from coupling.bodies import Bodies, couple, points_near, refresh, start
+from coupling.contact import nearest_geom
 from coupling.geoms import bounding_radius
 from mpm_env.config import nearest
 from mpm_env.fidelity import Fidelity
 from mpm_env.health import MOST_TRAVEL
 from mpm_env.motion import Motion
-from mpm_env.mpm import seeding
+from mpm_env.mpm import native, seeding
 from mpm_env.mpm.materials import Material
 from mpm_env.mpm.stability import courant_limit, largest_dt
 from mpm_env.mpm.substep import Bed
 from mpm_env.mpm.transfer import CHUNK
 from mpm_env.mpm.types import Grid, Particles, Wall
+from mpm_env.scene_cache import keep_programs
 from mpm_env.scene_config import BodiesConfig, SceneConfig, Vec3
 from mpm_env.scene_grains import WHOLE, axes_of, fill_of, material_of, whole
 
+SORTED_FROM = 65_536  # grains; fewer cost the same in any order that flow brings about
 CROWDED = 1.5  # grains near a tool may be packed this much denser than at the start
 ICE = 917.0  # kg/m^3, beyond which no snow is packed
 ROOM = 1.3  # how many more nodes than counted at the start may be near a tool, for how it turns and lies in the grid
@@ -64,6 +66,7 @@ class Scene:
     sizes: Sizes
     middle: float  # m, the slice's y in plane strain
     dtype: Any
+    kernels: str  # "native" or "xla"
 
     @property
     def dimension(self) -> int:
@@ -74,6 +77,11 @@ class Scene:
     def slots(self) -> int:
         """Room for grains."""
         return self.spans[-1][1] if self.spans else 0
+
+    @property
+    def sorts(self) -> bool:
+        """Whether grains are put in order now and then: only where their grid outgrows the cache."""
+        return self.slots >= SORTED_FROM
 
     def beds(self, materials: tuple[Material, ...]) -> tuple[Bed, ...]:
         """Materials with the slots that are theirs."""
@@ -92,7 +100,7 @@ class Scene:
 
 @partial(
     jax.tree_util.register_dataclass,
-    data_fields=["rigid", "grains", "materials", "steps", "health", "left", "reaction"],
+    data_fields=["rigid", "grains", "order", "materials", "steps", "health", "left", "reaction"],
     meta_fields=[],
 )
 @dataclass(frozen=True)
@@ -101,11 +109,21 @@ class State:
 
     rigid: Any  # mjx.Data, or None where a scene has no bodies
     grains: Particles
+    order: Array | None  # (n,) int32, the slot each grain had at the start; None where grains keep their slots
     materials: tuple[Material, ...]
     steps: Array  # () int32, rigid steps since the start
     health: Array  # () int32, sticky bits of mpm_env.health.Health
     left: Array  # () kg that left through open walls
     reaction: Array  # (G, 6) N and N m on each coupled geom about its body's centre, mean over the last rigid step
+
+    @property
+    def grains_at_home(self) -> Particles:
+        """The grains in the slots they had at the start, as numpy arrays: for whoever follows single grains."""
+        grains = jax.tree.map(np.asarray, self.grains)
+        if self.order is None:
+            return grains
+        home = np.argsort(np.asarray(self.order))
+        return jax.tree.map(lambda a: a[..., home], grains)
 
 
 def lift(a: Array, y: float = 0.0) -> Array:
@@ -116,7 +134,11 @@ def lift(a: Array, y: float = 0.0) -> Array:
 
 
 def build(config: SceneConfig, fidelity: Fidelity) -> Scene:
-    """A scene at a fidelity. Raises ValueError, in one sentence, for whatever cannot be simulated as asked."""
+    """A scene at a fidelity. Raises ValueError, in one sentence, for whatever cannot be simulated as asked.
+
+    Has JAX keep compiled programs on disk from here on, unless you decided otherwise: see `scene_cache.keep_programs`.
+    """
+    keep_programs()
     dtype = _dtype(fidelity)
     if config.plane_strain:
         fidelity = fidelity.model_copy(update={"dimension": 2})
@@ -151,6 +173,7 @@ def build(config: SceneConfig, fidelity: Fidelity) -> Scene:
         sizes=_sizes(bodies, grid, config, fidelity, at, middle) if bodies else Sizes(0, 0),
         middle=middle,
         dtype=dtype,
+        kernels=native.chosen(fidelity.kernels),
     )
     _refuse_overlap(scene)
     return scene
@@ -198,16 +221,14 @@ def initial(scene: Scene, key: Array, *, qpos: Array | None = None) -> State:
     )
     rigid = None
     if scene.bodies is not None:
-        at, speed = _keyframe(scene)
-        position, turn = scene.motion.mocap(0.0)
-        control = jnp.asarray(scene.motion.control(0.0))
-        rigid = start(
-            scene.bodies, at if qpos is None else qpos, speed, control, (jnp.asarray(position), jnp.asarray(turn))
-        )
+        rigid = start(scene.bodies, *_keyframe(scene), scene.motion.control(0.0), scene.motion.mocap(0.0))
+        if qpos is not None:
+            rigid = refresh(scene.bodies, rigid.replace(qpos=jnp.asarray(qpos, rigid.qpos.dtype)))
     geoms = len(scene.bodies.geoms) if scene.bodies else 0
     state = State(
         rigid=rigid,
         grains=grains,
+        order=jnp.arange(n, dtype=jnp.int32) if scene.sorts else None,
         materials=scene.materials,
         steps=jnp.zeros((), jnp.int32),
         health=jnp.zeros((), jnp.int32),
@@ -282,16 +303,16 @@ def _coupled(bodies: BodiesConfig, model: mujoco.MjModel) -> dict[int, float]:
     return out
 
 
-def _keyframe(scene: Scene) -> tuple[Array, Array]:
+def _keyframe(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     """Joint positions (nq,) and velocities (nv,) at the start: the named keyframe's, or the model's pose at rest."""
     assert scene.bodies is not None and scene.config.bodies is not None
     model, name = scene.bodies.model, scene.config.bodies.keyframe
     if name is None:
-        return jnp.asarray(model.qpos0), jnp.zeros((model.nv,))
+        return model.qpos0, np.zeros(model.nv)
     known = [model.key(i).name for i in range(model.nkey)]
     if name not in known:
         raise ValueError(f"The model has no keyframe {name!r}{nearest(name, known)}")
-    return jnp.asarray(model.key(name).qpos), jnp.asarray(model.key(name).qvel)
+    return model.key(name).qpos, model.key(name).qvel
 
 
 def _substeps(config: SceneConfig, f: Fidelity, grid: Grid, materials: tuple[Material, ...], motion: Motion) -> int:
@@ -354,7 +375,7 @@ def _refuse_overlap(scene: Scene) -> None:
     def look(key: Array) -> tuple[Array, Array]:
         state = initial(scene, key)
         d = state.rigid
-        phi, _, geom = distances(shapes, scene.world(state.grains.x).T, d.geom_xpos[geoms], d.geom_xmat[geoms])
+        phi, _, geom = nearest_geom(shapes, scene.world(state.grains.x), d.geom_xpos[geoms], d.geom_xmat[geoms])
         return jnp.where(state.grains.m > 0, phi, jnp.inf), geom
 
     phi, geom = map(np.asarray, jax.jit(look)(jax.random.key(0)))

@@ -16,16 +16,18 @@ from jax import Array, lax
 
 from coupling import bodies as rigid
 from coupling.bodies import Stance
-from coupling.contact import Points, distances
+from coupling.contact import Points, distances, nearest_geom
 from coupling.exchange import Exchange, exchange
-from coupling.geoms import Shape, bounding_radius, half_extents
+from coupling.geoms import Shape, bounding_radius, dot, half_extents
 from mpm_env.health import MOST_DEPTH, MOST_TRAVEL, Health
 from mpm_env.mpm.budgets import mass_that_left
+from mpm_env.mpm.sorting import in_order
 from mpm_env.mpm.stability import MOST_CELLS_PER_SUBSTEP
 from mpm_env.mpm.substep import substep
 from mpm_env.mpm.types import Particles
 from mpm_env.scene import NODE_DEPTH, Scene, State, inside_grid, lift
 
+ROUNDS = 8  # in which the grains near bodies can be stopped; up to an eighth of them is inside in most substeps
 HALFWAY = 0.5  # of the way to a thin geom's middle, from where a grain is about to come out on the other side
 MOST_RESIDUAL = 0.1  # share of the exchange's equation that may stay unsolved before it is called not converged
 
@@ -62,6 +64,9 @@ def advance(scene: Scene, state: State, drives: Drive) -> tuple[State, Array]:
 
 def rigid_step(scene: Scene, state: State, drive: Drive) -> State:
     """One rigid step with its substeps."""
+    if state.order is not None:
+        grains, order = in_order(scene.grid, state.grains, scene.spans, state.order)
+        state = replace(state, grains=grains, order=order)
     if scene.bodies is None:
         grains = _run_grains(scene, state)
         return _examined(scene, state, replace(state, grains=grains, steps=state.steps + 1), Health.WELL)
@@ -94,7 +99,7 @@ def _run_grains(scene: Scene, state: State, contact: Contact | None = None, touc
         return state.grains, lax.fori_loop(0, scene.mpm_per_rigid, lambda _, t: contact.coast(t), touch)
 
     def one(_: int, both: tuple[Particles, Any]) -> tuple[Particles, Any]:
-        return substep(scene.grid, beds, both[0], scene.mpm_dt, gravity, contact, both[1])
+        return substep(scene.grid, beds, both[0], scene.mpm_dt, gravity, contact, both[1], scene.kernels)
 
     grains, touch = lax.fori_loop(0, scene.mpm_per_rigid, one, (state.grains, touch))
     return grains if contact is None else (grains, touch)
@@ -112,6 +117,14 @@ class Touch(NamedTuple):
     residual: Array  # () worst share of an exchange left unsolved
 
 
+class Moves(NamedTuple):
+    """How contact moves some grains."""
+
+    grains: Array  # (K,) indices, their number where a slot is free
+    dx: Array  # (d, K) m
+    dv: Array  # (d, K) m/s
+
+
 class Contact(NamedTuple):
     """Grains against bodies over one rigid step: a Boundary of the continuum.
 
@@ -122,7 +135,7 @@ class Contact(NamedTuple):
     scene: Scene
     stance: Stance
     watched: Array  # (K,) indices into the flattened grid, its size where a slot is free
-    nodes_x: Array  # (K, 3) m
+    nodes_x: Array  # (3, K) m
     nodes_over: Array  # () bool, more than fit
     grains_near: Array  # (P,) indices of grains, their number where a slot is free
     grains_over: Array  # () bool
@@ -130,23 +143,20 @@ class Contact(NamedTuple):
     @classmethod
     def of(cls, scene: Scene, stance: Stance, p: Particles) -> Contact:
         """Look up the nodes and grains near the bodies."""
-        b, dx, d = scene.bodies, scene.grid.cell_size, scene.dimension
+        b, dx = scene.bodies, scene.grid.cell_size
         assert b is not None
         pos, mat = rigid.poses(b, stance, stance.centre, jnp.broadcast_to(jnp.eye(3), (len(b.bodies), 3, 3)))
-        flat = jnp.asarray(scene.grid.node_positions() + scene.grid.origin, scene.dtype)
-        nodes = (
-            flat if d == 3 else jnp.stack([flat[:, 0], jnp.full_like(flat[:, 0], scene.middle), flat[:, 1]], axis=-1)
-        )
-        phi = distances(b.shapes, nodes, pos, mat)[0]
+        nodes = scene.world(jnp.asarray(scene.grid.node_positions().T, scene.dtype))
+        phi = distances(b.shapes, nodes, pos, mat)
         band = (scene.fidelity.contact_band + MOST_TRAVEL) * dx
         near, over = _pick((phi < band) & (phi > -NODE_DEPTH * dx), scene.sizes.nodes)
         if scene.sizes.grains and scene.slots:
-            phi = distances(b.shapes, scene.world(p.x).T, pos, mat)[0]
+            phi = distances(b.shapes, scene.world(p.x), pos, mat)
             travel = scene.rigid_dt * jnp.sqrt(jnp.sum(p.v * p.v, axis=0))
             grains = _pick((phi < MOST_TRAVEL * dx + travel) & (p.m > 0), scene.sizes.grains)
         else:
             grains = (jnp.zeros((0,), jnp.int32), jnp.zeros((), bool))
-        return cls(scene, stance, near, nodes.at[near].get(mode="clip"), over, *grains)
+        return cls(scene, stance, near, nodes.at[:, near].get(mode="clip"), over, *grains)
 
     def start(self, q: Array) -> Touch:
         """Nothing has happened yet; joints move with q (nv,)."""
@@ -158,34 +168,50 @@ class Contact(NamedTuple):
 
     def nodes(self, touch: Touch, v: Array, m: Array) -> tuple[Touch, Array]:
         """Exchange momentum between bodies and the grid nodes within the band."""
-        at = self._points(touch, self.nodes_x)
+        at = self._nearest(touch, self.nodes_x)
         near = at[0] < self.scene.fidelity.contact_band * self.scene.grid.cell_size
-        points = Points(self.nodes_x, lift(v.T).T, jnp.where(near, m, 0), *at)
+        points = Points(self.nodes_x, lift(v.T), jnp.where(near, m, 0), *at)
         free = touch.q + self.scene.mpm_dt * self.stance.acceleration
         touch, done = self._exchange(touch, points, free)
-        return touch, self._flatten(done.impulse / jnp.where(points.m > 0, points.m, 1)[:, None])
+        return touch, self._flatten(done.impulse / jnp.where(points.m > 0, points.m, 1)).T
 
     def grains(self, touch: Touch, p: Particles) -> tuple[Touch, Particles]:
         """Move the bodies, then stop grains that ended up inside them and put those back to the surface."""
         touch = self._moved(touch)
         if not self.grains_near.size:
             return touch, p
-        near = self.grains_near
-        x = self.scene.world(p.x.at[:, near].get(mode="clip")).T
-        phi, n, geom = self._points(touch, x)
-        m = jnp.where(phi < 0, p.m.at[near].get(mode="fill", fill_value=0), 0)
-        points = Points(x, lift(p.v.at[:, near].get(mode="clip")).T, m, phi, n, geom)
+        near, room = self.grains_near, self.grains_near.size
+        x = self.scene.world(p.x.at[:, near].get(mode="clip"))
+        inside = (p.m.at[near].get(mode="fill", fill_value=0) > 0) & (self._distances(touch, x) < 0)
 
-        def stop(touch: Touch) -> tuple[Touch, Array]:
-            touch, done = self._exchange(touch, points, touch.q)
-            return touch, done.impulse / jnp.where(m > 0, m, 1)[:, None]
+        count = _count(inside)
+        few = -(-room // ROUNDS)
 
-        # Most substeps find no grain inside a body: then nothing is solved.
-        touch, change = lax.cond(jnp.any(m > 0), stop, lambda t: (t, jnp.zeros_like(points.v)), touch)
-        depth = jnp.where(m > 0, -phi, 0)
+        def stop(touch: Touch, first: Array) -> tuple[Touch, Moves]:
+            wanted = _find(count, first + jnp.arange(few, dtype=count.dtype))
+            return self._stopped(touch, p, near.at[wanted].get(mode="fill", fill_value=p.count))
+
+        def rest(touch: Touch, first: Array) -> tuple[Touch, Moves]:
+            none = jnp.zeros((self.scene.dimension, few), x.dtype)
+            return touch, Moves(jnp.full((few,), p.count, near.dtype), none, none)
+
+        # Most substeps find few grains inside a body: then all but the first rounds, or all, are rest.
+        firsts = few * jnp.arange(ROUNDS, dtype=count.dtype)
+        touch, moves = lax.scan(lambda touch, k: lax.cond(k < count[-1], stop, rest, touch, k), touch, firsts)
+        index, dx, dv = (jnp.moveaxis(a, 0, -2).reshape(*a.shape[1:-1], -1) for a in moves)
+        return touch, replace(p, x=p.x.at[:, index].add(dx, mode="drop"), v=p.v.at[:, index].add(dv, mode="drop"))
+
+    def _stopped(self, touch: Touch, p: Particles, index: Array) -> tuple[Touch, Moves]:
+        """Stop the grains with these indices (K,), their number where a slot is free, and put them on the surface."""
+        x, v = (a.at[:, index].get(mode="clip") for a in (p.x, p.v))
+        m = p.m.at[index].get(mode="fill", fill_value=0)
+        x = self.scene.world(x)
+        points = Points(x, lift(v), m, *self._nearest(touch, x))
+        touch, done = self._exchange(touch, points, touch.q)
+        depth = jnp.where(m > 0, -points.phi, 0)
         touch = touch._replace(depth=jnp.maximum(touch.depth, jnp.max(depth)))
-        x_new = p.x.at[:, near].add(self._flatten(depth[:, None] * n).T, mode="drop")
-        return touch, replace(p, x=x_new, v=p.v.at[:, near].add(self._flatten(change).T, mode="drop"))
+        change = done.impulse / jnp.where(m > 0, m, 1)
+        return touch, Moves(index, self._flatten(depth * points.n), self._flatten(change))
 
     def coast(self, touch: Touch) -> Touch:
         """A substep without any grain."""
@@ -208,13 +234,20 @@ class Contact(NamedTuple):
             }
         )
 
-    def _points(self, touch: Touch, x: Array) -> tuple[Array, Array, Array]:
+    def _distances(self, touch: Touch, x: Array) -> Array:
+        """Signed distances (K,) m of points x (3, K) m from the bodies where they are now."""
         b = self.scene.bodies
         assert b is not None
-        phi, n, geom = distances(b.shapes, x, *rigid.poses(b, self.stance, touch.centre, touch.turn))
+        return distances(b.shapes, x, *rigid.poses(b, self.stance, touch.centre, touch.turn))
+
+    def _nearest(self, touch: Touch, x: Array) -> tuple[Array, Array, Array]:
+        """The same with normals (3, K) in the grid's dimension and the geoms (K,) that are nearest."""
+        b = self.scene.bodies
+        assert b is not None
+        phi, n, geom = nearest_geom(b.shapes, x, *rigid.poses(b, self.stance, touch.centre, touch.turn))
         if self.scene.dimension == 2:
-            n = n.at[:, 1].set(0)
-            n = n / jnp.maximum(jnp.linalg.norm(n, axis=-1, keepdims=True), 1e-6)
+            n = n.at[1].set(0)
+            n = n / jnp.maximum(jnp.sqrt(dot(n, n)), 1e-6)
         return phi, n, geom
 
     def _exchange(self, touch: Touch, points: Points, free: Array) -> tuple[Touch, Exchange]:
@@ -245,8 +278,8 @@ class Contact(NamedTuple):
         return touch._replace(centre=touch.centre + h * twist[:, :3], turn=rigid.turned(touch.turn, twist[:, 3:], h))
 
     def _flatten(self, a: Array) -> Array:
-        """(K, 3) of space as (K, d) of the grid."""
-        return a if self.scene.dimension == 3 else a[:, ::2]
+        """Rows (3, K) of space as rows (d, K) of the grid."""
+        return a if self.scene.dimension == 3 else a[::2]
 
 
 def _half_thickness(shape: Shape) -> float:
@@ -267,8 +300,21 @@ def _reach(b: rigid.Bodies, body: int) -> float:
 
 def _pick(mask: Array, size: int) -> tuple[Array, Array]:
     """Indices (size,) where the mask (n,) holds, n where there are fewer, and whether there were more."""
-    index = jnp.nonzero(mask, size=size, fill_value=mask.shape[0])[0].astype(jnp.int32)
-    return index, jnp.sum(mask) > size
+    count = _count(mask)
+    return _find(count, jnp.arange(size, dtype=count.dtype)), count[-1] > size
+
+
+def _count(mask: Array) -> Array:
+    """How many of the mask (n,) hold up to here, (n,)."""
+    return jnp.cumsum(mask.astype(jnp.int32))
+
+
+def _find(count: Array, k: Array) -> Array:
+    """Indices (size,) of the k-th that hold, from 0, by their count (n,); n where there are fewer.
+
+    A search takes less time than jnp.nonzero, which scatters the whole mask.
+    """
+    return jnp.searchsorted(count, k + 1).astype(jnp.int32)
 
 
 def _bits(faults: dict[Health, Array]) -> Array:

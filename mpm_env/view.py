@@ -27,7 +27,7 @@ class View:
 
     scene: Scene
     time: float  # s
-    slots: np.ndarray  # (n,) int, which slots of the state these grains are
+    slots: np.ndarray  # (n,) int, the slots that these grains had at the start
     grains: np.ndarray  # (n, 3) float32 m
     speed: np.ndarray  # (n,) m/s
     material: np.ndarray  # (n,) int, index of the scene's grains entry
@@ -37,11 +37,12 @@ class View:
     def of(cls, scene: Scene, state: State) -> View:
         """Look at a state."""
         time = int(state.steps) * scene.rigid_dt
-        slots = np.flatnonzero(np.asarray(state.grains.m))
-        x = np.asarray(state.grains.x)[:, slots] + scene.grid.origin[:, None].astype(scene.dtype)
+        grains = state.grains_at_home
+        slots = np.flatnonzero(grains.m)
+        x = np.asarray(grains.x)[:, slots] + scene.grid.origin[:, None].astype(scene.dtype)
         if scene.dimension == 2:
             x = np.stack([x[0], np.full_like(x[0], scene.middle), x[1]])
-        speed = np.linalg.norm(np.asarray(state.grains.v)[:, slots], axis=0)
+        speed = np.linalg.norm(np.asarray(grains.v)[:, slots], axis=0)
         starts = np.asarray([a for a, _ in scene.spans], int)
         material = np.searchsorted(starts, slots, side="right") - 1
         return cls(scene, time, slots, x.T.astype(np.float32), speed, material, body_data(scene, state))

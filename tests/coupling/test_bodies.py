@@ -14,6 +14,7 @@ from coupling import bodies as rigid
 from coupling.bodies import Bodies, couple, points_near
 
 STEPS = 50
+FORWARD_TOLERANCE = 1e-4  # of each field's largest: the same float32 sums in another order, then a solver
 # Float32 over 50 steps against MuJoCo's float64; the arm moves with 1 rad/s. 3e-7 and 4e-6 observed.
 ARM_TOLERANCE = {"qpos": 2e-6, "qvel": 2e-5}
 # Two solutions of one equation in float32. 2e-7 observed.
@@ -60,6 +61,37 @@ TOOL = """
     <geom name="floor" type="plane" size="1 1 1"/>
     <geom name="ball" type="sphere" size=".1" pos="0 0 .5"/>
   </worldbody>
+</mujoco>"""
+
+
+EVERYTHING = """
+<mujoco>
+  <option timestep="0.004"/>
+  <worldbody>
+    <geom name="floor" type="plane" size="1 1 1"/>
+    <camera name="eye" pos="0 -1 1"/>
+    <body name="hand" mocap="true" pos="0 0 .5"><geom name="palm" type="box" size=".02 .02 .02"/></body>
+    <body name="held" pos="0 0 .4"><freejoint/><geom name="held" type="box" size=".05 .04 .03" mass=".5"/></body>
+    <body name="link" pos=".5 0 .3" gravcomp=".5">
+      <joint name="hinge" axis="0 1 0" range="-1 .1" limited="true" frictionloss=".1" stiffness="2" armature=".01"/>
+      <geom name="link" type="capsule" size=".02" fromto="0 0 0 .2 0 0" mass=".3"/>
+      <body pos=".2 0 0">
+        <joint name="slide" type="slide" axis="1 0 0" damping="3"/>
+        <geom name="tip" type="sphere" size=".03" mass=".2"/><site name="tip"/>
+      </body>
+    </body>
+  </worldbody>
+  <tendon>
+    <fixed name="rope" armature=".02" damping=".3">
+      <joint joint="hinge" coef=".7"/><joint joint="slide" coef="1"/>
+    </fixed>
+  </tendon>
+  <equality><weld body1="held" body2="hand"/></equality>
+  <actuator>
+    <position joint="hinge" kp="20"/><motor tendon="rope" gear="2"/>
+    <general site="tip" gear="0 0 1 0 0 0" dyntype="filter" dynprm=".1"/>
+  </actuator>
+  <sensor><framepos objtype="site" objname="tip"/><jointvel joint="hinge"/><accelerometer site="tip"/></sensor>
 </mujoco>"""
 
 
@@ -162,6 +194,37 @@ def test_a_box_between_grains_and_a_plane_is_held_in_the_exchange_too() -> None:
     """The plane answers the grains' load while they act, not a step later: 30 N would move 2 kg by 6 cm/s each step."""
     found = plane_run()
     np.testing.assert_allclose(found.qvel[-10:], found.expected[-10:], rtol=0, atol=HELD_TOLERANCE)
+
+
+def test_a_step_opens_from_fresh_data_as_by_mjx_forward() -> None:
+    """With a tendon, a weld, limits, friction, contact, activations and sensors: no stage of MJX is forgotten."""
+    b = coupled(model_of(EVERYTHING), "palm", "link")
+    d = at_rest(b)
+    rng = np.random.default_rng(0)
+    d = d.replace(qpos=d.qpos + 0.05 * rng.random(b.model.nq, np.float32), qvel=rng.random(b.model.nv, np.float32))
+    d = d.replace(ctrl=jnp.asarray([0.3, -0.5, 2.0]), act=jnp.asarray([0.4]), mocap_pos=d.mocap_pos + 0.01)
+    d = d.replace(qfrc_applied=rng.random(b.model.nv, np.float32))
+    still = jnp.zeros((len(b.bodies), 6))
+    found = jax.jit(lambda d: rigid.open_step(b, rigid.refresh(b, d), still)[0])(d)
+    oracle = jax.jit(lambda d: mjx.forward(b.mjx_model, d))(d)
+    assert np.abs(oracle.qfrc_constraint).max() > 1 and np.abs(oracle.sensordata).max() > 1, "little happens"
+    for (path, is_so), should in zip(
+        jax.tree_util.tree_flatten_with_path(found)[0], jax.tree.leaves(oracle), strict=True
+    ):
+        largest = np.abs(np.asarray(should)).max(initial=0)
+        np.testing.assert_allclose(
+            is_so, should, rtol=0, atol=FORWARD_TOLERANCE * largest, err_msg=jax.tree_util.keystr(path)
+        )
+
+
+@pytest.mark.parametrize("xml", [EVERYTHING, TOOL], ids=["joints", "mocap only"])
+def test_bodies_start_as_fresh_data(xml: str) -> None:
+    b = coupled(model_of(xml), "palm" if xml is EVERYTHING else "blade")
+    d = at_rest(b)
+    again = jax.jit(lambda d: rigid.refresh(b, d))(d)
+    assert [(a.shape, a.dtype) for a in jax.tree.leaves(d)] == [(a.shape, a.dtype) for a in jax.tree.leaves(again)]
+    for is_so, should in zip(jax.tree.leaves(d), jax.tree.leaves(again), strict=True):
+        np.testing.assert_allclose(is_so, should, rtol=0, atol=POSE_TOLERANCE)
 
 
 def test_coasting_brings_mocap_bodies_to_their_next_pose() -> None:

@@ -38,7 +38,10 @@ each_precision = pytest.mark.parametrize("dtype", ["float32", "float64"])
 
 
 class Instance(NamedTuple):
-    """Points against bodies, as numpy in float64; every field has a leading axis of instances."""
+    """Points against bodies, as numpy in float64; every field has a leading axis of instances.
+
+    Vectors of points are (instances, K, 3) here, the axis of space last, and rows (3, K) only where the code is called.
+    """
 
     p: Points
     t: Twists
@@ -104,7 +107,16 @@ CHAIN_BODIES = (0, 1, 1)
 
 @cache
 def solver(body_of: tuple[int, ...], iterations: int) -> Any:
-    return jax.jit(jax.vmap(lambda i: exchange(*i, body_of, iterations)))
+    def one(i: Instance) -> Exchange:
+        done = exchange(as_rows(i.p), *i[1:], body_of, iterations)
+        return done._replace(impulse=done.impulse.T)
+
+    return jax.jit(jax.vmap(one))
+
+
+def as_rows(p: Points) -> Points:
+    """Points with vectors (K, 3) as rows (3, K)."""
+    return p._replace(x=p.x.T, v=p.v.T, n=p.n.T)
 
 
 def solve(i: Instance, body_of: tuple[int, ...], dtype: str, iterations: int = ITERATIONS) -> Exchange:
@@ -172,10 +184,9 @@ def random_law(count: int = 400) -> tuple[Points, np.ndarray, np.ndarray]:
 def test_stiffness_is_the_derivative_of_the_law() -> None:
     p, w, mu = random_law()
     with jax.enable_x64(True):
-        alone = jax.vmap(lambda p, w, mu: impulses(jax.tree.map(lambda a: a[None], p), w[None], mu[None])[0])
-        slope = jax.vmap(jax.jacfwd(lambda w, p, mu: alone(*jax.tree.map(lambda a: a[None], (p, w, mu)))[0]))
+        slope = jax.vmap(jax.jacfwd(lambda w, p, mu: impulses(p, w, mu)))  # of one point, whose rows are numbers
         p, w, mu = jax.tree.map(jnp.asarray, (p, w, mu))
-        found, exact = np.asarray(stiffness(p, w, mu)), -np.asarray(slope(w, p, mu))
+        found, exact = np.moveaxis(stiffness(as_rows(p), w.T, mu), -1, 0), -np.asarray(slope(w, p, mu))
     np.testing.assert_allclose(found, exact, rtol=0, atol=DERIVATIVE_TOLERANCE)
     free = ~exact.any(axis=(1, 2))
     sticking = np.abs(exact - np.asarray(p.m)[:, None, None] * np.eye(3)).max(axis=(1, 2)) < DERIVATIVE_TOLERANCE
@@ -184,7 +195,7 @@ def test_stiffness_is_the_derivative_of_the_law() -> None:
 
 def test_a_point_that_leaves_is_let_go() -> None:
     p, w, mu = random_law()
-    f = np.asarray(impulses(p, w, mu))
+    f = np.asarray(impulses(as_rows(p), w.T, mu)).T
     leaves = np.sum(w * p.n, axis=1) > 0
     assert leaves.any()
     assert not f[leaves].any()
@@ -194,7 +205,7 @@ def test_a_point_that_leaves_is_let_go() -> None:
 def test_a_point_within_the_cone_sticks_and_one_outside_it_slides_on_the_cone() -> None:
     p, w, mu = random_law()
     p, w, mu = jax.tree.map(lambda a: a[np.sum(w * p.n, axis=1) < 0], (p, w, mu))
-    f = np.asarray(impulses(p, w, mu), np.float64)
+    f = np.asarray(impulses(as_rows(p), w.T, mu), np.float64).T
     after = w + f / p.m[:, None]
     approach = -np.sum(w * p.n, axis=1)
     sticks = mu * approach > np.linalg.norm(w + approach[:, None] * p.n, axis=1)
@@ -208,7 +219,7 @@ def test_a_point_within_the_cone_sticks_and_one_outside_it_slides_on_the_cone() 
 
 def test_the_law_only_dissipates() -> None:
     p, w, mu = random_law()
-    f = np.asarray(impulses(p, w, mu), np.float64)
+    f = np.asarray(impulses(as_rows(p), w.T, mu), np.float64).T
     after = w + f / p.m[:, None]
     assert np.max(np.sum(after**2 - w**2, axis=1)) <= 1e-6  # float32
     assert np.max(np.sum(f * after, axis=1)) <= 1e-6

@@ -2,14 +2,17 @@
 
 import itertools
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import jax
 import mujoco
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from coupling import geoms
+from coupling.contact import nearest_geom
 from coupling.geoms import BOUNDS, GEOM_SDF, Shape, Voxels
 
 SIZE = (0.3, 0.15, 0.1)  # m; each primitive reads from it what it needs
@@ -28,6 +31,7 @@ SAMPLE_TOLERANCE = 7e-5  # m; half a spacing of 2 mm, squared, over twice a dist
 VOXEL_TOLERANCE = 0.5  # voxels; a linear sample cuts off 0.29 at sharp edges (observed)
 NODE_TOLERANCE = 3e-8  # m; MuJoCo keeps vertices, and we distances, in float32: 6e-9 observed
 NORMAL_TOLERANCE = 1e-6  # float32
+SAME = 1e-9  # float64; through an ellipsoid's halvings
 
 each_primitive = pytest.mark.parametrize("kind", GEOM_SDF, ids=lambda k: geoms._type_name(k))
 each_precision = pytest.mark.parametrize("dtype", ["float32", "float64"])
@@ -368,3 +372,23 @@ def test_mesh_that_encloses_nothing_is_refused(tmp_path: Path) -> None:
 def test_too_few_or_too_many_cells_are_refused(cells: int, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=rf"cells = {cells} for the mesh of geom tool is outside 8\.\.256"):
         geoms.shape_of(mesh_model(L_VERTICES, L_FACES), 0, cells=cells, cache_dir=tmp_path)
+
+
+@pytest.mark.slow
+def test_the_nearest_of_many_geoms_is_found_as_if_each_were_alone(l_mesh: tuple[mujoco.MjModel, Shape]) -> None:
+    rng = np.random.default_rng(3)
+    sizes = rng.uniform(0.05, 0.2, (2 * len(GEOM_SDF), 3))
+    # No plane: every point is under one of two that are tilted.
+    kinds = [kind for kind in GEOM_SDF if GEOM_SDF[kind] is not geoms.plane]
+    shapes = (l_mesh[1], *(Shape(kind, tuple(size)) for kind, size in zip(2 * kinds, sizes, strict=False)))
+    pos, turn = rng.uniform(-0.6, 0.6, (len(shapes), 3)), Rotation.random(len(shapes), rng).as_matrix()
+    x = rng.uniform(-0.8, 0.8, (500, 3))
+    with jax.enable_x64(True):
+        phi, n, geom = map(np.asarray, jax.jit(partial(nearest_geom, shapes))(x.T, pos, turn))
+        local = [(x - p) @ R for p, R in zip(pos, turn, strict=True)]
+        alone = np.asarray([distances(shape, at) for shape, at in zip(shapes, local, strict=True)])
+        own = [normals(shape, at) @ R.T for shape, at, R in zip(shapes, local, turn, strict=True)]
+    assert set(geom) == set(range(len(shapes)))
+    np.testing.assert_allclose(phi, alone.min(axis=0), rtol=0, atol=SAME)
+    np.testing.assert_array_equal(geom, alone.argmin(axis=0))
+    np.testing.assert_allclose(n.T, np.asarray(own)[geom, np.arange(len(x))], rtol=0, atol=SAME)

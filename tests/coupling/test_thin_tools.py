@@ -35,6 +35,9 @@ UNDER = DX  # m below the floor
 SPEED = 0.3  # m/s
 STEPS = 125  # 0.15 m of travel: 6 cells
 
+ROUNDS_STEPS = 10  # in which a blade moves half a cell
+ROUNDS_TOLERANCE = 1e-5  # cells; float32
+
 LEAST_LEAK = 0.05  # of the swept mass, through half a cell without push-out; 0.09 and 0.13 observed
 
 
@@ -123,3 +126,20 @@ def test_no_sand_passes_through_a_thin_blade(blade: int, offset: float) -> None:
 def test_without_push_out_the_thinner_blade_would_leak(offset: float) -> None:
     """Negative control: what the grid alone keeps back."""
     assert drag(False, offset).leaked[0] > LEAST_LEAK
+
+
+@pytest.mark.slow
+def test_grains_are_stopped_in_rounds_as_they_are_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A blade that is told where to go takes each grain alone, so rounds of one grain must do what one round does."""
+    scene = bed(True)
+    start = jax.jit(partial(planted, scene))(blades_at(0.0, 0.0))
+    positions = np.asarray([blades_at(0.0, (k + 1) * DT) for k in range(ROUNDS_STEPS)])
+    turns = np.tile(np.asarray([1, 0, 0, 0], np.float32), (ROUNDS_STEPS, len(BLADES), 1))
+    drives = sim.Drive(jnp.zeros((ROUNDS_STEPS, 0)), jnp.asarray(positions), jnp.asarray(turns))
+
+    def after(rounds: int) -> np.ndarray:
+        monkeypatch.setattr(sim, "ROUNDS", rounds)
+        end, _ = jax.jit(lambda state: sim.advance(scene, state, drives))(start)
+        return np.asarray(end.grains.x)
+
+    np.testing.assert_allclose(after(scene.sizes.grains), after(1), rtol=0, atol=ROUNDS_TOLERANCE * DX)

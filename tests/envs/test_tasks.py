@@ -167,6 +167,17 @@ def test_a_state_that_is_not_finite_is_truncated_and_its_numbers_stay_finite(env
 
 
 @pytest.mark.slow
+def test_a_step_writes_over_the_episode_before(env: GrainsEnv) -> None:
+    env.reset(seed=0)
+    assert env.episode is not None
+    before = env.episode
+    env.step(np.zeros(3, np.float32))
+    assert before.state.grains.x.is_deleted()
+    assert before.state.rigid.xpos.is_deleted()
+    assert np.isfinite(np.asarray(env.task.scene.materials[0].rho)), "the scene's own arrays went with it"
+
+
+@pytest.mark.slow
 def test_a_picture_shows_robot_and_grains(env: GrainsEnv) -> None:
     env.reset(seed=0)
     image = env.render()

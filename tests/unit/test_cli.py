@@ -96,6 +96,7 @@ def test_run_prints_what_it_came_to(tiny: Path, capsys: pytest.CaptureFixture[st
     assert cli.main(again) == 0
     said = capsys.readouterr()
     assert "tiny: 0.12 s simulated, complete" in said.out
+    assert "kernels: native (" in said.out or "kernels: xla" in said.out
     assert "mass 1.6 kg of 1.6 kg, 0 kg left the box" in said.out
     assert "run.rrd, run.npz, run.png, summary.json" in said.out
     assert "warp" not in said.out + said.err

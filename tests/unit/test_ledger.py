@@ -125,7 +125,7 @@ def test_figures_say_how_far_snow_was_packed() -> None:
 
 @pytest.mark.parametrize(("J_P", "capped"), [(0.7, True), (0.85, False)])
 def test_report_says_where_snow_hardened_to_its_cap(J_P: float, capped: bool) -> None:
-    numerics = {"grains": 1, "cell_size_m": 0.01, "mpm_dt_s": 1e-4}
+    numerics = {"grains": 1, "cell_size_m": 0.01, "mpm_dt_s": 1e-4, "kernels": "xla"}
     wall = dict.fromkeys(("build", "compile", "run", "log", "picture", "total"), 0.0)
     summary = {"scene": "snow", "ended": "complete", "numerics": numerics, "wall_s": wall}
     said = "\n".join(report({**summary, "health": {"sentences": []}, "figures": packed(0.8, J_P)}))

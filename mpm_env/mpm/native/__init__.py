@@ -209,4 +209,11 @@ def chosen(wish: str) -> str:
     return "xla" if wish == "xla" or why_not() else "native"
 
 
-__all__ = ["LANES", "LAWS", "chosen", "to_grains", "to_nodes", "why_not", "width"]
+def spoken(kernels: str) -> str:
+    """Kernels as a summary names them: with the width of their registers, or why native ones are not there."""
+    if kernels == "native":
+        return f"native ({width()})"
+    return f"xla (no native ones: {why_not()})" if why_not() else "xla"
+
+
+__all__ = ["LANES", "LAWS", "chosen", "spoken", "to_grains", "to_nodes", "why_not", "width"]

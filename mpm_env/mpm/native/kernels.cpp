@@ -6,12 +6,12 @@
 namespace MPM_ISA {
 namespace {
 
-constexpr int SERIAL = 2048;  // fewer grains than this are not worth waking a thread for
+constexpr int SERIAL = 4096;  // grains per thread at least: fewer are not worth waking one for
 
 template <class S, int D> void run(const ToNodes& t) {
   const int64_t cores = t.batch * t.grains < SERIAL ? 1 : threads();
   if (t.batch >= cores && t.batch > 1) return each(int(t.batch), [&](int b) { scatter<S, D>(t, b, 1); });
-  const int parts = int(std::min<int64_t>(cores, t.grains / SERIAL + 1));
+  const int parts = int(std::min<int64_t>(cores, std::max<int64_t>(t.grains / SERIAL, 1)));
   for (int64_t b = 0; b < t.batch; ++b) scatter<S, D>(t, b, parts);
 }
 
