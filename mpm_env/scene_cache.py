@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
 
 import jax
 
@@ -20,7 +21,8 @@ def keep_programs() -> None:
     Does nothing where a folder is chosen (JAX_COMPILATION_CACHE_DIR or jax.config), where JAX_ENABLE_COMPILATION_CACHE
     is 0, or where the folder cannot be written. JAX never empties it: delete it whenever you like.
     """
-    if jax.config.jax_compilation_cache_dir is not None or not jax.config.jax_enable_compilation_cache:
+    settings: Any = jax.config  # whose settings mypy does not see in every version of JAX
+    if settings.jax_compilation_cache_dir is not None or not settings.jax_enable_compilation_cache:
         return
     try:
         # An empty XDG_CACHE_HOME counts as not set (XDG Base Directory Specification).
