@@ -70,5 +70,6 @@ def test_a_second_process_finds_the_programs_of_the_first_and_says_nothing(tmp_p
         subprocess.run([sys.executable, "-c", PROGRAM], env=env, capture_output=True, text=True, check=True)
         for _ in range(2)
     )
-    assert (int(first.stdout), int(second.stdout)) == (0, 1)
+    # At least the one: on a busy machine a small program may take long enough to be kept too.
+    assert int(first.stdout) == 0 and int(second.stdout) >= 1
     assert first.stderr == second.stderr == ""
