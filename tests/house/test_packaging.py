@@ -1,6 +1,7 @@
 """The wheel carries what the package reads, and the installed package works from any folder."""
 
 import os
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -8,6 +9,8 @@ import zipfile
 from pathlib import Path
 
 import pytest
+
+from mpm_env.mpm.native.build import build
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 SUFFIXES_OF_DATA = {".xml", ".yaml", ".yml", ".json", ".stl", ".obj", ".png", ".typed"}
@@ -64,6 +67,34 @@ def test_wheel_carries_the_licence_and_nothing_else(wheel: Path) -> None:
     info = f"mpm_env-{project()['version']}.dist-info"
     assert f"{info}/licenses/LICENSE" in names
     assert {name.split("/")[0] for name in names} == {"mpm_env", "coupling", info}
+
+
+def test_wheel_carries_the_kernels_and_is_for_this_kind_of_machine(wheel: Path) -> None:
+    if shutil.which("g++") is None:
+        assert wheel.name.endswith("py3-none-any.whl")
+        return
+    with zipfile.ZipFile(wheel) as archive:
+        assert "mpm_env/mpm/native/kernels.so" in archive.namelist()
+    assert "-py3-none-linux" in wheel.name
+
+
+@pytest.mark.parametrize(
+    ("settings", "word"),
+    [
+        ({"PATH": "/nowhere"}, "there is no C++ compiler"),
+        ({"CXX": "/bin/false"}, "/bin/false failed: it said nothing"),
+        ({"CXX": "/nowhere/g++"}, "/nowhere/g++ failed"),
+    ],
+)
+def test_kernels_that_cannot_be_built_are_explained(
+    settings: dict[str, str], word: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.delenv("CXX", raising=False)
+    for name, value in settings.items():
+        monkeypatch.setenv(name, value)
+    why_not = build(tmp_path / "kernels.so")
+    assert why_not is not None and word in why_not
+    assert not list(tmp_path.iterdir())
 
 
 def project() -> dict[str, str]:

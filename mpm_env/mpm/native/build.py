@@ -66,8 +66,8 @@ def build(library: Path) -> str | None:
                 objects = list(workers.map(compiled, [*jobs, ("ffi.cpp", about), ("threads.cpp", [])]))
             _run([*compiler, "-shared", "-pthread", *objects, "-o", f"{scratch}/{LIBRARY}"])
         except (OSError, subprocess.CalledProcessError) as error:
-            said = getattr(error, "stderr", "") or str(error)
-            return f"{compiler[0]} failed: {said.strip().splitlines()[-1] if said.strip() else error}"
+            said = (getattr(error, "stderr", None) or "it said nothing").strip().splitlines()
+            return f"{compiler[0]} failed: {said[-1]}"
         shutil.move(f"{scratch}/{LIBRARY}", library)
     return None
 
