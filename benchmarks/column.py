@@ -51,16 +51,7 @@ def column(
     }
     resolve(data, Path())
     numerics = {"cells": n, "dimension": dimension, "precision": precision, "mpm_dt": dt, "rigid_dt": STRIDE * dt}
-    return build(SceneConfig(**data), Fidelity(**numerics, **kernels_of(kernels)))
-
-
-def kernels_of(name: str) -> dict[str, str]:
-    """The fidelity's setting for these kernels; older versions have only the pure XLA ones, and no setting."""
-    if "kernels" in Fidelity.model_fields:
-        return {"kernels": name}
-    if name == "native":
-        raise ValueError("This version has no native kernels.")
-    return {}
+    return build(SceneConfig(**data), Fidelity(**numerics, kernels=kernels))
 
 
 def kernels_here() -> tuple[list[str], list[str]]:
@@ -122,7 +113,7 @@ def run(a: argparse.Namespace) -> None:
         return np.asarray(scene.world(p.x)).T[here], v.T[here]
 
     facts = {
-        "code": f"mpm-env {a.kernels if kernels_of(a.kernels) else 'xla'}",
+        "code": f"mpm-env {a.kernels}",
         "material": a.material,
         "dimension": a.dimension,
         "precision": a.precision,

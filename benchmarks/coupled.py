@@ -18,7 +18,7 @@ import numpy as np
 
 from benchmarks import box, job, results
 from benchmarks.clock import ROUNDS, cpu_seconds, significant, spread
-from benchmarks.column import MATERIALS, kernels_here, kernels_of
+from benchmarks.column import MATERIALS, kernels_here
 from benchmarks.compare import in_rounds
 from mpm_env import Fidelity, Scene, SceneConfig, State, advance, build, initial, load_fidelity, read_scene, scripted
 
@@ -55,12 +55,12 @@ def box_drop(kernels: str) -> Scene:
             "friction": box.FRICTION,
         },
     }
-    return build(SceneConfig(**data), Fidelity(cells=2, **kernels_of(kernels)))
+    return build(SceneConfig(**data), Fidelity(cells=2, kernels=kernels))
 
 
-def digging(kernels: str, fidelity: str) -> Scene:
+def digging(kernels: str, quick: bool) -> Scene:
     """The shipped digging scene."""
-    return build(read_scene("bucket_dig"), load_fidelity(fidelity).model_copy(update=kernels_of(kernels)))
+    return build(read_scene("bucket_dig"), load_fidelity("draft" if quick else "standard", [f"kernels={kernels}"]))
 
 
 class Run:
@@ -106,7 +106,7 @@ def dropped(run: Run) -> dict[str, Any]:
 
 def measured(kernels: str, quick: bool) -> dict[str, Any]:
     """Both jobs with these kernels."""
-    run = Run(digging(kernels, "draft" if quick else "standard"), DIG_STEPS)
+    run = Run(digging(kernels, quick), DIG_STEPS)
     out = {"dig": run.timed(ROUNDS)}
     drop = Run(box_drop(kernels), DROP_STEPS)
     calls = ROUNDS if quick else round(box.DURATION / drop.per_call)

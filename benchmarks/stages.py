@@ -25,11 +25,12 @@ from jax import Array, lax
 
 from benchmarks import job, limits, results
 from benchmarks.clock import ROUNDS, cpu_seconds, in_turns, significant
-from benchmarks.column import STRIDE, column, kernels_here, kernels_of, program
+from benchmarks.column import STRIDE, column, kernels_here, program
+from benchmarks.coupled import digging
 from coupling import bodies
-from mpm_env import Drive, Scene, State, build, initial, load_fidelity, read_scene, rigid_step, scripted
+from mpm_env import Drive, Scene, State, initial, rigid_step, scripted
 from mpm_env.log import Recorder
-from mpm_env.mpm import substep, transfer
+from mpm_env.mpm import sorting, substep, transfer
 from mpm_env.mpm.types import Particles
 from mpm_env.view import View, no_reactions, write_frame
 
@@ -62,11 +63,8 @@ def touched(p: Particles, out: Array) -> Particles:
 
 
 def sorted_by_cell(scene: Scene, p: Particles) -> Particles:
-    """All grains in the order of their cells: what sorting would cost in JAX, whether or not the step does it."""
-    cell = jnp.floor(p.x / scene.grid.cell_size).astype(jnp.int32)
-    flat = jnp.ravel_multi_index(tuple(cell), scene.grid.shape, mode="clip")
-    order = jnp.argsort(flat)
-    return jax.tree.map(lambda a: a[..., order], p)
+    """All grains in the order of their cells, whether or not the step would sort them now."""
+    return sorting.by_cell(sorting.cells(scene.grid, p, scene.spans), p)
 
 
 def continuum(scene: Scene, state: State, kernels: str) -> dict[str, Callable[[], Any]]:
@@ -131,8 +129,7 @@ def log_seconds(scene: Scene, state: State, frames: int = 10) -> float:
 
 def dig(kernels: str, quick: bool) -> tuple[Scene, State, Callable[[State, Drive], State], Drive]:
     """The digging scene with the bucket in the bed, its compiled rigid step, and what drives the next one."""
-    fidelity = load_fidelity("draft" if quick else "standard").model_copy(update=kernels_of(kernels))
-    scene = build(read_scene("bucket_dig"), fidelity)
+    scene = digging(kernels, quick)
     whole = jax.jit(partial(rigid_step, scene))
     state = initial(scene, jax.random.key(0))
     every = scripted(scene, 0, round(DIG_AT / scene.rigid_dt) + 1)

@@ -17,6 +17,7 @@ import numpy as np
 
 from benchmarks import job, results
 from benchmarks.clock import significant
+from benchmarks.column import kernels_here
 from benchmarks.compare import in_rounds
 
 REPS, ROUNDS = 3, 3
@@ -96,10 +97,9 @@ def main() -> None:
     every = {" ".join(words): words for sweep in wanted.values() for words in sweep.values()}
     heaps = {f"--n {n}": ["--n", str(n), "--tend", "0.1"] for n in (HEAPS if not a.quick else (10,))}
     rows: dict[str, Any] = {}
-    left_out: list[str] = []
+    kinds, missing = kernels_here()
     with tempfile.TemporaryDirectory() as cache:  # so that a variant is compiled once, not in each round
         setting = {"JAX_COMPILATION_CACHE_DIR": cache, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
-        kinds = kernels_here(own, setting, left_out)
         jobs = {f"{k}|{key}": [*own, "--kernels", k, *words] for key, words in every.items() for k in kinds}
         got, failed = in_rounds(jobs, 1 if a.quick else ROUNDS, setting)
         checks = {f"{k}|{key}": [*own, "--kernels", k, *words] for key, words in heaps.items() for k in kinds}
@@ -118,16 +118,9 @@ def main() -> None:
         "sweeps": rows,
         "fit": {k: fit(list(rows["size"][k].values())) for k in kinds if len(rows["size"][k]) > 1},
         "same_job": {name.replace("|", " "): round(same_job(row), 5) for name, row in heaped.items()},
-        "left_out": [*left_out, *failed, *more],
+        "left_out": [*missing, *failed, *more],
     }
     results.write("throughput", content)
-
-
-def kernels_here(own: list[str], setting: dict[str, str], left_out: list[str]) -> list[str]:
-    """Which kernels this machine and version have; a word on those it has not."""
-    tried, failed = in_rounds({k: [*own, "--kernels", k, "--n", "4"] for k in ("native", "xla")}, 1, setting)
-    left_out += failed
-    return list(tried)
 
 
 if __name__ == "__main__":

@@ -270,16 +270,17 @@ def shape_of(model: mujoco.MjModel, geom: int, *, cells: int = 64, cache_dir: Pa
             f"geom {name} is of type {_type_name(kind)}, which cannot touch grains; "
             f"supported are {supported}: replace it by those or leave it out of the coupling."
         )
-    return Shape(kind, (a, b, c), _voxels_of(model, geom, name, cells, cache_dir or _default_cache()))
+    return Shape(kind, (a, b, c), _voxels_of(model, geom, name, cells, cache_dir or user_cache("sdf")))
 
 
 def _type_name(kind: int) -> str:
     return mujoco.mjtGeom(kind).name.removeprefix("mjGEOM_").lower()
 
 
-def _default_cache() -> Path:
+def user_cache(name: str) -> Path:
+    """The folder `mpm_env/name` in `$XDG_CACHE_HOME` or `~/.cache`, there or not; RuntimeError if there is no home."""
     # An empty XDG_CACHE_HOME counts as not set (XDG Base Directory Specification).
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mpm_env" / "sdf"
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mpm_env" / name
 
 
 def _voxels_of(model: mujoco.MjModel, geom: int, name: str, cells: int, cache_dir: Path) -> Voxels:

@@ -7,10 +7,11 @@ does so only when told; building a scene tells it, unless you have.
 from __future__ import annotations
 
 import os
-from pathlib import Path
 from typing import Any
 
 import jax
+
+from coupling.geoms import user_cache
 
 LEAST_COMPILE_TIME = 0.05  # s: what takes less is compiled as fast as it is found in the folder
 
@@ -25,8 +26,7 @@ def keep_programs() -> None:
     if settings.jax_compilation_cache_dir is not None or not settings.jax_enable_compilation_cache:
         return
     try:
-        # An empty XDG_CACHE_HOME counts as not set (XDG Base Directory Specification).
-        place = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mpm_env" / "programs"
+        place = user_cache("programs")
         place.mkdir(parents=True, exist_ok=True)
     except (OSError, RuntimeError):  # RuntimeError: there is no home
         return

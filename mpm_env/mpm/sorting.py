@@ -7,6 +7,7 @@ order again; a bed at rest stays as it is.
 from __future__ import annotations
 
 from functools import partial
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +17,8 @@ from jax import Array, lax
 from mpm_env.mpm.transfer import weights
 from mpm_env.mpm.types import Grid, Particles
 
+Rows = TypeVar("Rows")
+
 MOST_DISORDER = 0.05  # share of slots out of order from where sorting pays for itself within a few hundred substeps
 
 
@@ -24,13 +27,13 @@ def in_order(grid: Grid, p: Particles, spans: tuple[tuple[int, int], ...], order
 
     Empty slots come last in their span.
     """
-    cell = _cells(grid, p, spans)
+    cell = cells(grid, p, spans)
+    return lax.cond(disorder(cell) > MOST_DISORDER, by_cell, lambda _, both: both, cell, (p, order))
 
-    def sort() -> tuple[Particles, Array]:
-        by_cell = jnp.argsort(cell, stable=True)
-        return jax.tree.map(partial(jnp.take, indices=by_cell, axis=-1, mode="clip"), (p, order))
 
-    return lax.cond(disorder(cell) > MOST_DISORDER, sort, lambda: (p, order))
+def by_cell(cell: Array, rows: Rows) -> Rows:
+    """Rows (.., n) in the order of their cells (n,)."""
+    return jax.tree.map(partial(jnp.take, indices=jnp.argsort(cell, stable=True), axis=-1, mode="clip"), rows)
 
 
 def disorder(cell: Array) -> Array:
@@ -38,7 +41,7 @@ def disorder(cell: Array) -> Array:
     return jnp.mean(cell[1:] < cell[:-1])
 
 
-def _cells(grid: Grid, p: Particles, spans: tuple[tuple[int, int], ...]) -> Array:
+def cells(grid: Grid, p: Particles, spans: tuple[tuple[int, int], ...]) -> Array:
     """The cell of each slot (n,), counted on from span to span."""
     base, _, _ = weights(p.x, grid.cell_size, grid.shape)
     cell = jnp.where(p.m > 0, jnp.ravel_multi_index(tuple(base), grid.shape, mode="clip"), grid.nodes)

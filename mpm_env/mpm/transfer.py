@@ -103,7 +103,8 @@ def p2g(grid: Grid, p: Particles, dt: float | Array, chunk: int = CHUNK) -> Arra
 
 
 def g2p(grid: Grid, node_v: Array, x: Array) -> tuple[Array, Array]:
-    """Velocity (d, n) m/s and affine velocity (d, d, n) 1/s of grains at x, from node velocities (*shape, d).
+    """Velocity (d, n) m/s and affine velocity (d, d, n) 1/s of grains at x, from node velocities (*shape, d), behind
+    which other channels may follow.
 
     v_p = sum w v_i, C_p = sum w v_i (x_i - x_p)^T / D (J15 eq. 8, with D = dx^2/4).
     """

@@ -27,6 +27,7 @@ from mpm_env.mpm.materials import Elastic, Material, Sand, Snow
 from mpm_env.mpm.materials.protocol import LEAST_B, lame
 from mpm_env.mpm.materials.sand import VOLUME_CORRECTION_CAP
 from mpm_env.mpm.materials.snow import MOST_LN_JP
+from mpm_env.mpm.native.sources import source_hash
 from mpm_env.mpm.types import MARGIN, WALL_KINDS, Grid, Particles
 
 LIBRARY = Path(__file__).parent / "kernels.so"
@@ -48,7 +49,7 @@ def why_not() -> str | None:
     if library.mpm_env_api() > _own_api():
         return "they were built for a newer jaxlib: install the package again"
     library.mpm_env_source.restype = ctypes.c_char_p
-    if library.mpm_env_source().decode() != _source_hash():
+    if library.mpm_env_source().decode() != source_hash():
         return "they are older than their sources: install the package again"
     if not library.mpm_env_runs_here():
         return "this processor lacks AVX2"
@@ -70,12 +71,6 @@ def _own_api() -> int:
     text = (Path(jax.ffi.include_dir()) / "xla/ffi/api/c_api.h").read_text()
     major, minor = (int(re.search(rf"#define XLA_FFI_API_{n} (\d+)", text)[1]) for n in ("MAJOR", "MINOR"))  # type: ignore[index]
     return major * 1000 + minor
-
-
-def _source_hash() -> str:
-    from mpm_env.mpm.native.sources import source_hash
-
-    return source_hash()
 
 
 def to_nodes(

@@ -12,9 +12,9 @@ struct NoLaw {};
 // law needs every register.
 template <class S, int D, class L>
 __attribute__((noinline)) void answer(const L& law, S dt, const S* C, S* e, S* tau, S* history, int64_t n) {
-  Sym<S, D> old, trial, stress;
+  Sym<S, D> old, stress;
   Pack<S> G[D][D], M[D][D];  // dt grad v, and G b: b_trial - I = e + M + M^T + M G^T
-  for (int k = 0; k < Sym<S, D>::count; ++k) trial.c[k] = old.c[k] = Pack<S>::load(e + k * n);
+  for (int k = 0; k < Sym<S, D>::count; ++k) old.c[k] = Pack<S>::load(e + k * n);
   for (int i = 0; i < D; ++i)
     for (int j = 0; j < D; ++j) G[i][j] = dt * Pack<S>::load(C + (i * D + j) * n);
   for (int i = 0; i < D; ++i)
@@ -22,14 +22,11 @@ __attribute__((noinline)) void answer(const L& law, S dt, const S* C, S* e, S* t
       M[i][j] = G[i][j];
       for (int k = 0; k < D; ++k) M[i][j] = M[i][j] + G[i][k] * old.at(k, j);
     }
-  auto entry = [&](int i, int j) {
+  Sym<S, D> trial = symmetric<S, D>(old.c[2], [&](int i, int j) {
     Pack<S> sum = old.at(i, j) + M[i][j] + M[j][i];
     for (int k = 0; k < D; ++k) sum = sum + M[i][k] * G[j][k];
     return sum;
-  };
-  trial.c[0] = entry(0, 0); trial.c[1] = entry(1, 1);
-  if constexpr (D == 2) trial.c[3] = entry(0, 1);
-  else { trial.c[2] = entry(2, 2); trial.c[3] = entry(1, 2); trial.c[4] = entry(0, 2); trial.c[5] = entry(0, 1); }
+  });
   Pack<S> memory = history ? Pack<S>::load(history) : Pack<S>(S(0));
   law(trial, stress, memory);
   for (int k = 0; k < Sym<S, D>::count; ++k) { trial.c[k].store(e + k * n); stress.c[k].store(tau + k * n); }
@@ -45,9 +42,7 @@ template <class S, int D, class L> void gather(const ToGrains& t, int64_t b, int
   S *x = rows(t.x, D), *v = rows(t.v, D), *C = rows(t.C, D * D), *e = rows(t.e, STRESSES), *tau = rows(t.tau, STRESSES);
   S* history = rows(t.history, int(t.memory));
   const S* m = (const S*)t.m + b * n;
-  int64_t count = 4;
-  for (int a = 0; a < D; ++a) count *= t.grid.shape[a];
-  const S* nodes = (const S*)t.nodes + b * count;
+  const S* nodes = (const S*)t.nodes + 4 * b * g.nodes;
   const S* parameter = (const S*)t.parameter + b * t.parameters;
   const L law = [&] { if constexpr (strains) return L(parameter + 1); else return L{}; }();
   const S per_cell = S(1 / t.grid.cell_size), dt = parameter[0], per_D = S(4 / t.grid.cell_size);

@@ -16,6 +16,15 @@ template <class S, int D> struct Sym {
   }
 };
 
+// The tensor with these in-plane entries (i, j), and in plane strain this one out of plane.
+template <class S, int D, class F> INLINE Sym<S, D> symmetric(Pack<S> out_of_plane, F entry) {
+  Sym<S, D> r;
+  r.c[0] = entry(0, 0); r.c[1] = entry(1, 1);
+  if constexpr (D == 2) { r.c[2] = out_of_plane; r.c[3] = entry(0, 1); }
+  else { r.c[2] = entry(2, 2); r.c[3] = entry(1, 2); r.c[4] = entry(0, 2); r.c[5] = entry(0, 1); }
+  return r;
+}
+
 // Principal values of a tensor and, by columns, its in-plane axes.
 template <class S, int D> struct Principal {
   Pack<S> value[3], axis[D][D];
@@ -69,33 +78,20 @@ template <class S> INLINE Principal<S, 3> eigen(const Sym<S, 3>& e) {
 }
 
 template <class S, int D> INLINE Sym<S, D> compose(const Principal<S, D>& r, const Pack<S>* value) {
-  Sym<S, D> out;
-  auto entry = [&](int i, int j) {
+  return symmetric<S, D>(value[2], [&](int i, int j) {
     Pack<S> sum = r.axis[i][0] * value[0] * r.axis[j][0];
     for (int k = 1; k < D; ++k) sum = sum + r.axis[i][k] * value[k] * r.axis[j][k];
     return sum;
-  };
-  out.c[0] = entry(0, 0); out.c[1] = entry(1, 1);
-  if constexpr (D == 2) { out.c[2] = value[2]; out.c[3] = entry(0, 1); }
-  else { out.c[2] = entry(2, 2); out.c[3] = entry(1, 2); out.c[4] = entry(0, 2); out.c[5] = entry(0, 1); }
-  return out;
+  });
 }
 
 // Product of symmetric tensors with the same axes.
-template <class S> INLINE Sym<S, 3> product(const Sym<S, 3>& a, const Sym<S, 3>& b) {
-  Sym<S, 3> r;
-  constexpr int pair[6][2] = {{0, 0}, {1, 1}, {2, 2}, {1, 2}, {0, 2}, {0, 1}};
-  for (int k = 0; k < 6; ++k) {
-    const int i = pair[k][0], j = pair[k][1];
-    r.c[k] = a.at(i, 0) * b.at(0, j) + a.at(i, 1) * b.at(1, j) + a.at(i, 2) * b.at(2, j);
-  }
-  return r;
-}
-template <class S> INLINE Sym<S, 2> product(const Sym<S, 2>& a, const Sym<S, 2>& b) {
-  Sym<S, 2> r;
-  r.c[0] = a.c[0] * b.c[0] + a.c[3] * b.c[3]; r.c[1] = a.c[1] * b.c[1] + a.c[3] * b.c[3];
-  r.c[2] = a.c[2] * b.c[2]; r.c[3] = a.c[0] * b.c[3] + a.c[3] * b.c[1];
-  return r;
+template <class S, int D> INLINE Sym<S, D> product(const Sym<S, D>& a, const Sym<S, D>& b) {
+  return symmetric<S, D>(a.c[2] * b.c[2], [&](int i, int j) {
+    Pack<S> sum = a.at(i, 0) * b.at(0, j);
+    for (int k = 1; k < D; ++k) sum = sum + a.at(i, k) * b.at(k, j);
+    return sum;
+  });
 }
 
 // Power series of the logarithm and the exponential: exact to the last digit where no element of e exceeds `limit`.

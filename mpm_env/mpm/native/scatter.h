@@ -63,9 +63,7 @@ template <class S, int D> struct Scatter {
   Scatter(const ToNodes& t, const Plan& plan, int64_t b)
       : t(t), plan(plan), x(at(t.x, b, D)), v(at(t.v, b, D)), C(at(t.C, b, D * D)), tau(at(t.tau, b, STRESSES)),
         m(at(t.m, b, 1)), V0(at(t.V0, b, 1)), gravity((const S*)t.step + b * (D + 1) + 1), dt(gravity[-1]), g(t.grid) {
-    int64_t count = 4;
-    for (int a = 0; a < D; ++a) count *= t.grid.shape[a];
-    nodes = (S*)t.nodes + b * count;
+    nodes = (S*)t.nodes + 4 * b * g.nodes;
   }
   const S* at(const void* p, int64_t b, int rows) const { return (const S*)p + b * rows * t.grains; }
 
@@ -223,10 +221,9 @@ template <class S, int D> void scatter(const ToNodes& t, int64_t b, int parts) {
   const int64_t planes = t.grid.shape[0];
   survey<S, D>(t, (const S*)t.x + b * D * t.grains, (const S*)t.m + b * t.grains, plan);
   const Scatter<S, D> s(t, plan, b);
-  int64_t nodes = planes * s.g.node[0];
   for (int64_t k = 0; k < t.watch; ++k) {
     int32_t i = t.watched[b * t.watch + k];
-    if (i >= 0 && i < nodes) std::fill(s.nodes + 4 * i, s.nodes + 4 * i + 4, S(0));
+    if (i >= 0 && i < s.g.nodes) std::fill(s.nodes + 4 * i, s.nodes + 4 * i + 4, S(0));
   }
   if (parts == 1) return s.planes(0, planes);
   // Each part owns planes, with about as many grains as the others; what reaches over a border is computed by both.

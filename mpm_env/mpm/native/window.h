@@ -23,9 +23,11 @@ template <class S> struct Window {  // of sixteen grains: first node, and the we
 template <int D> struct Strides {
   int64_t node[D];   // nodes between neighbours along each axis
   int64_t last[D];   // the last first node of a window
+  int64_t nodes;     // of the whole grid
   explicit Strides(const GridShape& g) {
     int64_t s = 1;
     for (int a = D - 1; a >= 0; --a) { node[a] = s; s *= g.shape[a]; last[a] = g.shape[a] - 3; }
+    nodes = s;
     last[D - 1] -= 1;  // a row is read and written four nodes wide
   }
 };
