@@ -101,12 +101,12 @@ def _bytes(v: Any) -> int:
 
 @contextmanager
 def in_chunks_of(grains: int) -> Iterator[None]:
-    """Programs traced inside walk so many grains at a time."""
-    usual, substep.CHUNK = substep.CHUNK, grains
+    """Programs traced inside walk so many grains at a time, whatever the backend would choose."""
+    usual, substep.chunk_of = substep.chunk_of, lambda p: min(grains, p.count)
     try:
         yield
     finally:
-        substep.CHUNK = usual
+        substep.chunk_of = usual
 
 
 def substep_cost(scene: Scene, envs: int = 1) -> Cost:

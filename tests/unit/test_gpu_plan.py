@@ -7,6 +7,7 @@ from jax import lax
 
 from benchmarks import gpu
 from benchmarks.column import column
+from mpm_env import initial
 
 CPU_ONLY = "mpm_env_"  # the native kernels' custom calls
 
@@ -47,8 +48,18 @@ def test_cost_counts_loops_and_bytes_by_hand() -> None:
 
 
 def test_chunks_are_as_before_after_a_count() -> None:
-    before = gpu.substep.CHUNK
+    grains = initial(column(4, kernels="xla"), jax.random.key(0)).grains
+    before = gpu.substep.chunk_of(grains)
     with pytest.raises(ZeroDivisionError), gpu.in_chunks_of(7):
-        assert before != gpu.substep.CHUNK
+        assert before != gpu.substep.chunk_of(grains) == 7
         raise ZeroDivisionError
-    assert before == gpu.substep.CHUNK
+    assert before == gpu.substep.chunk_of(grains)
+
+
+def test_chunks_can_be_asked_for_on_a_gpu_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    """There the package takes all grains at once, and the benchmark still has both to compare."""
+    grains = initial(column(8, kernels="xla"), jax.random.key(0)).grains
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert gpu.substep.chunk_of(grains) == grains.count > 512
+    with gpu.in_chunks_of(512):
+        assert gpu.substep.chunk_of(grains) == 512
