@@ -57,7 +57,7 @@ clean:  ## remove what the other targets made, .venv too
 
 # A .venv made by hand is kept and brought to the pinned versions; one that does not run is made anew. The build
 # tools come first, so that they are pinned like the rest and the package builds without a second environment.
-$(READY): pyproject.toml constraints.txt $(wildcard mpm_env/mpm/native/*.h mpm_env/mpm/native/*.cpp mpm_env/mpm/native/build.py)
+$(READY): pyproject.toml constraints.txt $(wildcard mpm_env/native/*.h mpm_env/native/*.cpp mpm_env/native/build.py)
 	@if ! $(BIN)/python -c '' 2>/dev/null; then \
 		for python in $(CANDIDATES); do \
 			if "$$python" -c '$(WILL_DO)' 2>/dev/null; then found="$$python"; break; fi; \

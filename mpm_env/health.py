@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from enum import IntFlag
 
+import jax.numpy as jnp
+from jax import Array
+
 MOST_DEPTH = 0.5  # cells a grain may stand inside a body before contact is called lost
 MOST_TRAVEL = 0.25  # cells a body may move in one rigid step: the points near it are looked up once per rigid step
 
@@ -44,3 +47,10 @@ def sentences(bits: int) -> list[str]:
 def names(bits: int) -> list[str]:
     """The names of the bits that are set."""
     return [bit.name or "" for bit in Health if bit and bit & bits]
+
+
+def as_bits(faults: dict[Health, Array]) -> Array:
+    """Faults as one integer of health bits."""
+    return sum((jnp.where(at, int(bit), 0) for bit, at in faults.items()), start=jnp.zeros((), jnp.int32)).astype(
+        jnp.int32
+    )

@@ -12,10 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
+from mpm_env import native
 from mpm_env.config import parse
 from mpm_env.fidelity import Fidelity
 from mpm_env.log import Recording
-from mpm_env.mpm import native
 from mpm_env.run import versions
 from mpm_env.scene import build, initial
 from mpm_env.scene_config import SceneConfig

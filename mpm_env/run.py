@@ -19,11 +19,11 @@ import jax
 import numpy as np
 from tqdm import tqdm
 
+from mpm_env import native
 from mpm_env.fidelity import Fidelity
 from mpm_env.health import Health, names, sentences
 from mpm_env.ledger import Ledger
 from mpm_env.log import COLOUR_RANGES, Recorder
-from mpm_env.mpm import native
 from mpm_env.render import save_png
 from mpm_env.scene import Scene, State, build, initial
 from mpm_env.scene_config import SceneConfig

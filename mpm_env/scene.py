@@ -18,11 +18,12 @@ from jax import Array
 from coupling.bodies import Bodies, couple, points_near, refresh, start
 from coupling.contact import nearest_geom
 from coupling.geoms import bounding_radius
+from mpm_env import native
 from mpm_env.config import nearest
 from mpm_env.fidelity import Fidelity
 from mpm_env.health import MOST_TRAVEL
 from mpm_env.motion import Motion
-from mpm_env.mpm import native, seeding
+from mpm_env.mpm import seeding
 from mpm_env.mpm.materials import Material
 from mpm_env.mpm.stability import courant_limit, largest_dt
 from mpm_env.mpm.substep import Bed

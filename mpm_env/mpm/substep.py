@@ -14,7 +14,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from mpm_env.mpm import native
+from mpm_env import native
+from mpm_env.mpm import kernels as in_cpp
 from mpm_env.mpm.linalg3 import matrix_rows
 from mpm_env.mpm.materials import Material
 from mpm_env.mpm.transfer import CHUNK, each_chunk, g2p, p2g
@@ -58,7 +59,7 @@ def substep(
 ) -> tuple[Particles, Any]:
     """Advance the grains by dt; gravity (d,) m/s^2. Returns the grains and the boundary's carry.
 
-    kernels: "native" or "xla", two implementations of the same equations, or "auto" (see `mpm_env.mpm.native`).
+    kernels: "native" or "xla", two implementations of the same equations, or "auto" (see `mpm_env.native`).
     """
     kernels = "xla" if p.count % native.LANES else native.chosen(kernels)
     watched = jnp.zeros((0,), jnp.int32) if boundary is None else boundary.watched
@@ -91,7 +92,7 @@ def to_nodes(grid: Grid, p: Particles, dt: float | Array, gravity: Array, watche
 
     if kernels == "xla":
         return reference(p, dt, gravity)
-    return native.to_nodes(grid, p, dt, gravity, watched, LEAST_MASS, reference)
+    return in_cpp.to_nodes(grid, p, dt, gravity, watched, LEAST_MASS, reference)
 
 
 def move(grid: Grid, bed: Bed, p: Particles, nodes: Array, dt: float | Array, kernels: str) -> Particles:
@@ -103,9 +104,9 @@ def move(grid: Grid, bed: Bed, p: Particles, nodes: Array, dt: float | Array, ke
 
     if kernels == "xla":
         return reference(p, nodes, dt, bed.material)
-    if type(bed.material) in native.LAWS:
-        return native.to_grains(grid, bed.material, span, p, nodes, dt, reference)
-    return strain(bed, native.to_grains(grid, None, span, p, nodes, dt, reference), dt)
+    if type(bed.material) in in_cpp.LAWS:
+        return in_cpp.to_grains(grid, bed.material, span, p, nodes, dt, reference)
+    return strain(bed, in_cpp.to_grains(grid, None, span, p, nodes, dt, reference), dt)
 
 
 def chunk_of(p: Particles) -> int:

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from coupling import bodies as rigid
-from mpm_env import sim
+from mpm_env import sim, sim_contact
 from mpm_env.config import parse
 from mpm_env.fidelity import Fidelity
 from mpm_env.health import Health
@@ -131,14 +131,14 @@ def test_without_push_out_the_thinner_blade_would_leak(offset: float) -> None:
 @pytest.mark.slow
 def test_grains_are_stopped_in_rounds_as_they_are_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """A blade that is told where to go takes each grain alone, so rounds of one grain must do what one round does."""
-    scene = bed(True)
+    scene = replace(bed(True), kernels="xla")
     start = jax.jit(partial(planted, scene))(blades_at(0.0, 0.0))
     positions = np.asarray([blades_at(0.0, (k + 1) * DT) for k in range(ROUNDS_STEPS)])
     turns = np.tile(np.asarray([1, 0, 0, 0], np.float32), (ROUNDS_STEPS, len(BLADES), 1))
     drives = sim.Drive(jnp.zeros((ROUNDS_STEPS, 0)), jnp.asarray(positions), jnp.asarray(turns))
 
     def after(rounds: int) -> np.ndarray:
-        monkeypatch.setattr(sim, "ROUNDS", rounds)
+        monkeypatch.setattr(sim_contact, "ROUNDS", rounds)
         end, _ = jax.jit(lambda state: sim.advance(scene, state, drives))(start)
         return np.asarray(end.grains.x)
 

@@ -20,7 +20,8 @@ LINES_AT_MOST = 400  # longer files are a sign of a missing noun
 FLOORS = {
     "coupling": 1,
     "mpm_env.mpm": 1,
-    "mpm_env.mpm.native.build": 1,  # runs when the package is built, and may use what builds it
+    "mpm_env.native": 0,
+    "mpm_env.native.build": 0,  # runs when the package is built, and may use what builds it
     "mpm_env.config": 2,
     "mpm_env.fidelity": 2,
     "mpm_env.health": 2,
@@ -198,7 +199,7 @@ def test_files_are_short_and_named_after_an_idea() -> None:
 
 def test_rules_see_both_packages_and_every_floor() -> None:
     parts = {part_of(module) for module in LIBRARY}
-    assert {FLOORS[part] for part in parts if part} == {1, 2, 3, 4, 5}
+    assert {FLOORS[part] for part in parts if part} == {0, 1, 2, 3, 4, 5}
     assert {"coupling", "mpm_env.mpm"} <= parts
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from mpm_env.mpm.native.build import build
+from mpm_env.native.build import build
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 SUFFIXES_OF_DATA = {".xml", ".yaml", ".yml", ".json", ".stl", ".obj", ".png", ".typed"}
@@ -74,7 +74,7 @@ def test_wheel_carries_the_kernels_and_is_for_this_kind_of_machine(wheel: Path) 
         assert wheel.name.endswith("py3-none-any.whl")
         return
     with zipfile.ZipFile(wheel) as archive:
-        assert "mpm_env/mpm/native/kernels.so" in archive.namelist()
+        assert "mpm_env/native/kernels.so" in archive.namelist()
     assert "-py3-none-linux" in wheel.name
 
 

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 from jax import Array, lax
 
-from mpm_env.mpm import native
+from mpm_env import native
+from mpm_env.mpm.kernels import LAWS
 from mpm_env.mpm.materials import Elastic, Sand, Snow
 from mpm_env.mpm.materials.protocol import LEAST_B
 from mpm_env.mpm.substep import Bed, move, substep, to_nodes
@@ -248,7 +249,7 @@ DIGEST = """
 import hashlib, sys, jax, numpy as np
 sys.path.insert(0, {root!r})
 from tests.unit.test_native import grains, material, walk
-from mpm_env.mpm import native
+from mpm_env import native
 p = grains(3, "float32")
 after = walk(p, (material("sand", "float32"),), d=3, beds=((0, p.count),), kernels="native")
 print(native.width(), hashlib.sha256(b"".join(np.asarray(a).tobytes() for a in jax.tree.leaves(after))).hexdigest())
@@ -329,7 +330,7 @@ def test_without_a_library_there_is_a_word_and_plain_xla(monkeypatch: pytest.Mon
 
 def test_least_b_is_one_number() -> None:
     """The kernels are told the constants of the reference; they have none of their own."""
-    numbers = [native.LAWS[type(m)](m)[1] for m in (material(law, "float32") for law in ("elastic", "sand", "snow"))]
+    numbers = [LAWS[type(m)](m)[1] for m in (material(law, "float32") for law in ("elastic", "sand", "snow"))]
     assert all(row[-1] == LEAST_B for row in numbers)
 
 

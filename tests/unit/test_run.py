@@ -15,12 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mpm_env import log
+from mpm_env import log, native
 from mpm_env.cli import report
 from mpm_env.config import parse
 from mpm_env.fidelity import Fidelity
 from mpm_env.ledger import Ledger
-from mpm_env.mpm import native
 from mpm_env.replay import compare
 from mpm_env.run import FILES, prepare, rhythm_of, run, versions
 from mpm_env.scene import build

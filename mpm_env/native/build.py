@@ -60,7 +60,11 @@ def build(library: Path) -> str | None:
 
         narrow = "AVX2" if x86 else platform.machine()
         about = [f'-DMPM_SOURCE="{source_hash()}"', f'-DMPM_NARROW="{narrow}"', f"-I{headers}"]
-        jobs = [("kernels.cpp", [f"-DMPM_ISA={isa}", *([flag] if x86 else [])]) for isa, flag in WIDTHS.items()]
+        jobs = [
+            (source, [f"-DMPM_ISA={isa}", *([flag] if x86 else [])])
+            for source in ("kernels.cpp", "contact.cpp")
+            for isa, flag in WIDTHS.items()
+        ]
         try:
             with ThreadPoolExecutor(os.cpu_count()) as workers:
                 objects = list(workers.map(compiled, [*jobs, ("ffi.cpp", about), ("threads.cpp", [])]))
@@ -91,7 +95,7 @@ class Hook(BuildHookInterface):
         tag = sysconfig.get_platform().replace("-", "_").replace(".", "_")
         build_data["pure_python"] = False
         build_data["tag"] = f"py3-none-{tag}"
-        build_data["artifacts"].append(f"mpm_env/mpm/native/{LIBRARY}")
+        build_data["artifacts"].append(f"mpm_env/native/{LIBRARY}")
 
 
 def get_build_hook() -> type[BuildHookInterface]:

@@ -1,5 +1,5 @@
 // The constitutive laws of mpm_env/mpm/materials, sixteen grains at a time. Parameters come in the order that
-// mpm_env/mpm/native/__init__.py gives them; equations and sources are in the Python classes, which stay the reference.
+// mpm_env/mpm/kernels.py gives them; equations and sources are in the Python classes, which stay the reference.
 #pragma once
 #include "kernels.h"
 #include "pack.h"

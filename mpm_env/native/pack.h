@@ -62,7 +62,16 @@ template <class S> INLINE Bits<S> whole(Pack<S> a) {  // towards zero
   Bits<S> r; for (int k = 0; k < Pack<S>::K; ++k) r.p[k] = __builtin_convertvector(a.p[k], typename Bits<S>::Part); return r; }
 template <class S> INLINE Bits<S> floored(Pack<S> a) { Bits<S> i = whole(a); return i + (a < number<S>(i)); }
 template <class T> INLINE bool any(Pack<T> mask) {
-  T r = 0; for (int k = 0; k < Pack<T>::K; ++k) for (int l = 0; l < Pack<T>::N; ++l) r |= mask.p[k][l]; return r != 0; }
+  for (int k = 0; k < Pack<T>::K; ++k)
+#if NATIVE_BYTES == 64
+    if (sizeof(T) == 4 ? _mm512_movepi32_mask((__m512i)mask.p[k]) : _mm512_movepi64_mask((__m512i)mask.p[k])) return true;
+#elif NATIVE_BYTES == 32
+    if (_mm256_movemask_epi8((__m256i)mask.p[k])) return true;
+#else
+    for (int l = 0; l < Pack<T>::N; ++l) if (mask.p[k][l]) return true;
+#endif
+  return false;
+}
 
 // These keep a NaN in their first argument, so that a sick grain stays visible.
 template <class S> INLINE Pack<S> largest(Pack<S> a, S b) { return select<S>(a < b, Pack<S>(b), a); }

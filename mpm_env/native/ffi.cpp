@@ -89,8 +89,61 @@ ffi::Error to_grains(ffi::AnyBuffer nodes, ffi::AnyBuffer m, ffi::AnyBuffer para
   return ffi::Error::Success();
 }
 
+GeomTable geoms_of(Ints kind, Ints first, Ints nodes, Floats size, Floats reach, Floats origin, Floats spacing,
+                   const ffi::AnyBuffer& voxels) {
+  return {int64_t(kind.size()), kind.begin(), first.begin(), nodes.begin(), size.begin(), reach.begin(), origin.begin(),
+          spacing.begin(), static_cast<const float*>(voxels.untyped_data())};
+}
+
+ffi::Error near(ffi::AnyBuffer x, ffi::AnyBuffer high, ffi::AnyBuffer pos, ffi::AnyBuffer mat, ffi::AnyBuffer voxels,
+                ffi::Result<ffi::AnyBuffer> index, ffi::Result<ffi::AnyBuffer> found, Ints kind, Ints first, Ints nodes,
+                Floats size, Floats reach, Floats origin, Floats spacing, double low) {
+  Near t{};
+  t.geoms = geoms_of(kind, first, nodes, size, reach, origin, spacing, voxels);
+  t.batch = batch_of(x, 2);
+  t.points = x.dimensions().back();
+  t.room = index->dimensions().back();
+  t.low = low;
+  t.x = x.untyped_data(); t.high = high.untyped_data(); t.pos = pos.untyped_data(); t.mat = mat.untyped_data();
+  t.index = static_cast<int32_t*>(index->untyped_data());
+  t.found = static_cast<int32_t*>(found->untyped_data());
+  (has_wide() ? wide::near : narrow::near)(t, x.element_type() == ffi::F64);
+  return ffi::Error::Success();
+}
+
+ffi::Error meet(ffi::AnyBuffer x, ffi::AnyBuffer v, ffi::AnyBuffer m, ffi::AnyBuffer pos, ffi::AnyBuffer mat,
+                ffi::AnyBuffer centre, ffi::AnyBuffer J, ffi::AnyBuffer d, ffi::AnyBuffer M, ffi::AnyBuffer mu,
+                ffi::AnyBuffer q_free, ffi::AnyBuffer voxels, ffi::Result<ffi::AnyBuffer> phi,
+                ffi::Result<ffi::AnyBuffer> n, ffi::Result<ffi::AnyBuffer> q, ffi::Result<ffi::AnyBuffer> impulse,
+                ffi::Result<ffi::AnyBuffer> wrench, ffi::Result<ffi::AnyBuffer> residual,
+                ffi::Result<ffi::AnyBuffer> scale, Ints kind, Ints first, Ints nodes, Floats size, Floats reach,
+                Floats origin, Floats spacing, Ints body_of, int64_t iterations, bool plane_strain, double within) {
+  Meet t{};
+  t.geoms = geoms_of(kind, first, nodes, size, reach, origin, spacing, voxels);
+  t.body_of = body_of.begin();
+  t.batch = batch_of(x, 2);
+  t.points = x.dimensions().back();
+  t.bodies = centre.dimensions()[centre.dimensions().size() - 2];
+  t.nv = q_free.dimensions().back();
+  t.iterations = iterations;
+  t.plane_strain = plane_strain;
+  t.reach = within;
+  t.x = x.untyped_data(); t.v = v.untyped_data(); t.m = m.untyped_data();
+  t.pos = pos.untyped_data(); t.mat = mat.untyped_data(); t.centre = centre.untyped_data();
+  t.J = J.untyped_data(); t.d = d.untyped_data(); t.M = M.untyped_data();
+  t.mu = mu.untyped_data(); t.q_free = q_free.untyped_data();
+  t.phi = phi->untyped_data(); t.n = n->untyped_data(); t.q = q->untyped_data();
+  t.impulse = impulse->untyped_data(); t.wrench = wrench->untyped_data();
+  t.residual = residual->untyped_data(); t.scale = scale->untyped_data();
+  (has_wide() ? wide::meet : narrow::meet)(t, x.element_type() == ffi::F64);
+  return ffi::Error::Success();
+}
+
 #define GRID_ATTRIBUTES \
   .Attr<Ints>("shape").Attr<Ints>("kinds").Attr<Floats>("friction").Attr<double>("cell_size").Attr<int64_t>("margin")
+#define GEOM_ATTRIBUTES \
+  .Attr<Ints>("kind").Attr<Ints>("first").Attr<Ints>("nodes").Attr<Floats>("size").Attr<Floats>("reach") \
+  .Attr<Floats>("origin").Attr<Floats>("spacing")
 #define ARG Arg<ffi::AnyBuffer>()
 #define RET Ret<ffi::AnyBuffer>()
 
@@ -101,6 +154,12 @@ XLA_FFI_DEFINE_HANDLER_SYMBOL(mpm_env_to_nodes, to_nodes,
 XLA_FFI_DEFINE_HANDLER_SYMBOL(mpm_env_to_grains, to_grains,
                               ffi::Ffi::Bind().ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.RET.RET.RET.RET.RET.RET GRID_ATTRIBUTES
                                   .Attr<int64_t>("law").Attr<int64_t>("start").Attr<int64_t>("stop"));
+XLA_FFI_DEFINE_HANDLER_SYMBOL(mpm_env_near, near,
+                              ffi::Ffi::Bind().ARG.ARG.ARG.ARG.ARG.RET.RET GEOM_ATTRIBUTES.Attr<double>("low"));
+XLA_FFI_DEFINE_HANDLER_SYMBOL(mpm_env_meet, meet,
+                              ffi::Ffi::Bind().ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.RET.RET.RET.RET.RET.RET.RET
+                                  GEOM_ATTRIBUTES.Attr<Ints>("body_of").Attr<int64_t>("iterations")
+                                  .Attr<bool>("plane_strain").Attr<double>("within"));
 
 // Read through ctypes before anything is registered.
 extern "C" {

@@ -1,0 +1,163 @@
+// Points against rigid geoms, for one width of registers, which MPM_ISA names. coupling/meeting.py says the same in JAX
+// and stays the reference.
+#include "exchange.h"
+#include "geoms.h"
+#include "threads.h"
+
+namespace MPM_ISA {
+namespace {
+
+// Rows (3, count) from point i on, a pack; beyond the last point, that one again.
+template <class S> INLINE void load(const S* a, int64_t count, int64_t i, Rows<S>& x) {
+  for (int r = 0; r < 3; ++r) {
+    const S* row = a + r * count;
+    if (i + W <= count) { x[r] = Pack<S>::load(row + i); continue; }
+    alignas(64) S lane[W];
+    for (int64_t l = 0; l < W; ++l) lane[l] = row[std::min(i + l, count - 1)];
+    x[r] = Pack<S>::load(lane);
+  }
+}
+
+// Walks through points (3, count) in packs: visit(first point of the pack, how many, the pack, the geoms worth a look).
+// Packs that are farther than `limit(first, last)` from every geom are passed over.
+template <class S, class L, class F> INLINE void walk(const std::vector<Geom<S>>& geoms, const S* x, int64_t count, L limit, F visit) {
+  std::vector<const Geom<S>*> some;
+  some.reserve(geoms.size());
+  for (int64_t i = 0; i < count; i += BLOCK_PACKS * W) {
+    Rows<S> at[BLOCK_PACKS];
+    const int64_t end = std::min<int64_t>(count, i + BLOCK_PACKS * W);
+    const int packs = int((end - i + W - 1) / W);
+    for (int k = 0; k < packs; ++k) load<S>(x, count, i + k * W, at[k]);
+    worth_a_look<S>(geoms, at, packs, limit(i, end), some);
+    if (some.empty()) continue;
+    for (int k = 0; k < packs; ++k) visit(i + k * W, std::min<int64_t>(W, end - i - k * W), at[k], some);
+  }
+}
+
+template <class S> void run(const Near& t, int64_t b) {
+  const int64_t N = t.points, G = t.geoms.count;
+  const S *x = (const S*)t.x + b * 3 * N, *high = (const S*)t.high + b * N, low = S(t.low);
+  const auto geoms = placed<S>(t.geoms, (const S*)t.pos + b * 3 * G, (const S*)t.mat + b * 9 * G);
+  int32_t *index = t.index + b * t.room, found = 0;
+  walk<S>(
+      geoms, x, N, [&](int64_t i, int64_t end) { return *std::max_element(high + i, high + end); },
+      [&](int64_t i, int64_t count, const Rows<S>& at, const auto& some) {
+        alignas(64) S most[W], phi[W];
+        for (int64_t l = 0; l < W; ++l) most[l] = high[i + std::min(l, count - 1)];
+        nearest<S>(some, at, Pack<S>::load(most)).phi.store(phi);
+        for (int64_t l = 0; l < count; ++l)
+          if (phi[l] < most[l] && phi[l] > low && found++ < t.room) index[found - 1] = int32_t(i + l);
+      });
+  for (int64_t k = found; k < t.room; ++k) index[k] = int32_t(N);
+  t.found[b] = found;
+}
+
+template <class S> void run(const Meet& t, int64_t b) {
+  typedef typename IntOf<S>::type I;
+  const int64_t K = t.points, G = t.geoms.count, B = t.bodies, nv = t.nv;
+  const S *v = (const S*)t.v + b * 3 * K, *m = (const S*)t.m + b * K;
+  const S *centre = (const S*)t.centre + b * 3 * B, *J = (const S*)t.J + b * 6 * B * nv, *d = (const S*)t.d + b * 6 * B;
+  const S *M = (const S*)t.M + b * nv * nv, *mu = (const S*)t.mu + b * G, *q_free = (const S*)t.q_free + b * nv;
+  S *phi = (S*)t.phi + b * K, *n = (S*)t.n + b * 3 * K, *impulse = (S*)t.impulse + b * 3 * K;
+  const auto geoms = placed<S>(t.geoms, (const S*)t.pos + b * 3 * G, (const S*)t.mat + b * 9 * G);
+  std::fill_n(phi, K, S(t.reach));
+  std::fill_n(n, 3 * K, S(0));
+  std::fill_n(impulse, 3 * K, S(0));
+
+  // Those with mass, and of them those near enough, with the geom that each faces.
+  std::vector<int32_t> heavy, who, faces;
+  for (auto* list : {&heavy, &who, &faces}) list->reserve(K);
+  for (int64_t i = 0; i < K; ++i) if (m[i] > 0) heavy.push_back(int32_t(i));
+  const int64_t some = int64_t(heavy.size());
+  std::vector<S> x(3 * some);
+  for (int r = 0; r < 3; ++r) for (int64_t a = 0; a < some; ++a) x[r * some + a] = ((const S*)t.x)[(b * 3 + r) * K + heavy[a]];
+  const Pack<S> limit = Pack<S>(S(t.reach));
+  walk<S>(
+      geoms, x.data(), some, [&](int64_t, int64_t) { return S(t.reach); },
+      [&](int64_t a, int64_t count, const Rows<S>& at, const auto& few) {
+        const Facing<S> f = nearest<S>(few, at, limit);
+        if (!any(f.phi < limit)) return;
+        Rows<S> normal;
+        normals<S>(geoms, at, f, normal);
+        if (t.plane_strain) {
+          normal[1] = Pack<S>(S(0));
+          Pack<S> size = largest(root(dot<S>(normal, normal)), S(1e-6));
+          for (int r = 0; r < 3; ++r) normal[r] = normal[r] / size;
+        }
+        alignas(64) S way[4][W];
+        alignas(64) I which[W];
+        f.geom.store(which);
+        f.phi.store(way[3]);
+        for (int r = 0; r < 3; ++r) normal[r].store(way[r]);
+        for (int64_t l = 0; l < count; ++l) {
+          if (which[l] < 0) continue;
+          const int32_t i = heavy[a + l];
+          phi[i] = way[3][l];
+          for (int r = 0; r < 3; ++r) n[r * K + i] = way[r][l];
+          who.push_back(int32_t(a + l));
+          faces.push_back(int32_t(which[l]));
+        }
+      });
+
+  const int64_t active = int64_t(who.size());
+  double energy = 0;  // twice the kinetic one
+  Crowd<S> crowd(int((active + W - 1) / W), int(nv));
+  for (int64_t a = 0; a < active; ++a) {
+    const int64_t i = heavy[who[a]], g = faces[a], body = t.body_of[g];
+    const S *c0 = centre + 3 * body, *Jb = J + 6 * nv * body, *db = d + 6 * body;
+    const S r[3] = {x[who[a]] - c0[0], x[some + who[a]] - c0[1], x[2 * some + who[a]] - c0[2]};
+    S* mine = crowd.at(a);  // rows are W apart
+    for (int c = 0; c < 3; ++c) {
+      const int p = c == 2 ? 0 : c + 1, q = c == 0 ? 2 : c - 1;
+      S w = v[c * K + i] - (db[c] + (db[3 + p] * r[q] - db[3 + q] * r[p]));
+      energy += double(m[i]) * v[c * K + i] * v[c * K + i];
+      for (int64_t j = 0; j < nv; ++j) {
+        const S lever = Jb[c * nv + j] + (Jb[(3 + p) * nv + j] * r[q] - Jb[(3 + q) * nv + j] * r[p]);
+        mine[(LEVER + 3 * j + c) * W] = lever;
+        w -= lever * q_free[j];
+      }
+      mine[(NORMAL + c) * W] = n[c * K + i];
+      mine[(SPEED + c) * W] = w;
+    }
+    mine[MASS * W] = m[i];
+    mine[FRICTION * W] = mu[g];
+  }
+
+  const Outcome done = exchange<S>(crowd, Vector(M, M + nv * nv), energy, int(t.iterations));
+  for (int64_t j = 0; j < nv; ++j) ((S*)t.q)[b * nv + j] = S(q_free[j] - done.scale * done.push[j]);
+  ((S*)t.residual)[b] = S(done.residual);
+  ((S*)t.scale)[b] = S(done.scale);
+
+  std::vector<double> wrench(6 * G, 0);
+  for (int64_t a = 0; a < active; a += W) {
+    Pack<S>* p = crowd.of(int(a / W));
+    Rows<S> w = {p[SPEED], p[SPEED + 1], p[SPEED + 2]}, f;
+    impulses<S>(p, w, f);
+    alignas(64) S lane[3][W];
+    for (int c = 0; c < 3; ++c) (f[c] * S(done.scale)).store(lane[c]);
+    for (int64_t l = 0; l < W && a + l < active; ++l) {
+      if (lane[0][l] == 0 && lane[1][l] == 0 && lane[2][l] == 0) continue;
+      const int64_t i = heavy[who[a + l]], g = faces[a + l];
+      const S* c0 = centre + 3 * t.body_of[g];
+      const S r[3] = {x[who[a + l]] - c0[0], x[some + who[a + l]] - c0[1], x[2 * some + who[a + l]] - c0[2]};
+      for (int c = 0; c < 3; ++c) {
+        const int e = (c + 1) % 3, h = (c + 2) % 3;
+        impulse[c * K + i] = lane[c][l];
+        wrench[6 * g + c] -= lane[c][l];
+        wrench[6 * g + 3 + c] -= double(r[e]) * lane[h][l] - double(r[h]) * lane[e][l];
+      }
+    }
+  }
+  for (int64_t k = 0; k < 6 * G; ++k) ((S*)t.wrench)[b * 6 * G + k] = S(wrench[k]);
+}
+
+template <class T> void pick(const T& t, bool f64) {
+  each(int(t.batch), [&](int b) { f64 ? run<double>(t, b) : run<float>(t, b); });
+}
+
+}  // namespace
+
+void near(const Near& t, bool f64) { pick(t, f64); }
+void meet(const Meet& t, bool f64) { pick(t, f64); }
+
+}  // namespace MPM_ISA

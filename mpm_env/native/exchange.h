@@ -1,0 +1,234 @@
+// Momentum exchange between many points and a few bodies in joint space. coupling/exchange.py says the same in JAX, with
+// the equations, and stays the reference. Points are taken sixteen at a time; what is summed over all of them is summed
+// and solved in f64.
+#pragma once
+#include <cmath>
+#include <limits>
+#include <vector>
+
+#include "geoms.h"
+
+namespace MPM_ISA {
+
+constexpr double TINY = 1e-20, SOLVED = 4, NOISE = 1e-6;  // as in exchange.py and contact.py
+constexpr int STEPS = 4;
+constexpr double STEP[STEPS] = {1, 0.5, 0.25, 0.0625};
+
+using Vector = std::vector<double>;
+
+// The sum over lanes.
+template <class S> INLINE double total(const Pack<S>& a) {
+  alignas(64) S lane[W];
+  a.store(lane);
+  double sum[4] = {0, 0, 0, 0};
+  for (int l = 0; l < W; ++l) sum[l % 4] += lane[l];
+  return (sum[0] + sum[1]) + (sum[2] + sum[3]);
+}
+
+// Solves A X = B for X in place of B (n, columns), by elimination with row exchange; A is used up.
+inline void solve(Vector& A, Vector& B, int n, int columns) {
+  for (int k = 0; k < n; ++k) {
+    int best = k;
+    for (int i = k + 1; i < n; ++i) if (std::abs(A[i * n + k]) > std::abs(A[best * n + k])) best = i;
+    if (best != k) {
+      for (int j = 0; j < n; ++j) std::swap(A[k * n + j], A[best * n + j]);
+      for (int j = 0; j < columns; ++j) std::swap(B[k * columns + j], B[best * columns + j]);
+    }
+    for (int i = k + 1; i < n; ++i) {
+      const double share = A[i * n + k] / A[k * n + k];
+      for (int j = k + 1; j < n; ++j) A[i * n + j] -= share * A[k * n + j];
+      for (int j = 0; j < columns; ++j) B[i * columns + j] -= share * B[k * columns + j];
+    }
+  }
+  for (int i = n; i-- > 0;)
+    for (int j = 0; j < columns; ++j) {
+      for (int k = i + 1; k < n; ++k) B[i * columns + j] -= A[i * n + k] * B[k * columns + j];
+      B[i * columns + j] /= A[i * n + i];
+    }
+}
+
+// Points against bodies, packed: sixteen at a time, the last ones without mass.
+template <class S> struct Crowd {
+  int packs, nv;
+  std::vector<Pack<S>> row;  // a pack's rows behind each other: normal, w, mass, friction, and 3 nv of lever
+
+  Crowd(int packs, int nv) : packs(packs), nv(nv), row(size_t(packs) * (8 + 3 * nv), Pack<S>(S(0))) {}
+  INLINE Pack<S>* of(int k) { return row.data() + size_t(k) * (8 + 3 * nv); }
+  INLINE S* at(int64_t i) { return reinterpret_cast<S*>(of(int(i / W))) + i % W; }  // of one point, to fill it
+};
+enum CrowdRow { NORMAL = 0, SPEED = 3, MASS = 6, FRICTION = 7, LEVER = 8 };
+
+// The inelastic contact with Coulomb friction: impulses f on points that move with w relative to their bodies.
+template <class S> INLINE void impulses(const Pack<S>* p, const Rows<S>& w, Rows<S>& f) {
+  const Pack<S> zero(S(0));
+  const Pack<S>* n = p + NORMAL;
+  Pack<S> approach = both(-(w[0] * n[0] + w[1] * n[1] + w[2] * n[2]), zero);
+  Rows<S> slide;
+  for (int i = 0; i < 3; ++i) slide[i] = w[i] + approach * n[i];
+  Pack<S> held = p[FRICTION] * approach / root(dot<S>(slide, slide) + S(TINY));
+  held = smallest(held, S(1));
+  Pack<S> touching = select<S>(approach > S(0), p[MASS], zero);
+  Pack<S> push = touching * (S(1) - held) * approach, hold = touching * held;
+  for (int i = 0; i < 3; ++i) f[i] = push * n[i] - hold * w[i];
+}
+
+// Derivative (3, 3) of minus the impulses by w.
+template <class S> INLINE void stiffness(const Pack<S>* p, const Rows<S>& w, Pack<S> D[3][3]) {
+  const Pack<S> zero(S(0)), one(S(1));
+  const Pack<S>* n = p + NORMAL;
+  Pack<S> approach = both(-(w[0] * n[0] + w[1] * n[1] + w[2] * n[2]), zero);
+  Rows<S> t;
+  for (int i = 0; i < 3; ++i) t[i] = w[i] + approach * n[i];
+  Pack<S> speed = root(dot<S>(t, t) + S(TINY)), ratio = p[FRICTION] * approach / speed;
+  for (int i = 0; i < 3; ++i) t[i] = t[i] / speed;
+  Pack<S> m = select<S>(approach > S(0), p[MASS], zero);
+  Bits<S> sticks = ratio >= S(1);
+  for (int i = 0; i < 3; ++i)
+    for (int j = 0; j < 3; ++j) {
+      Pack<S> eye = i == j ? one : zero, nn = n[i] * n[j];
+      Pack<S> slides = nn - p[FRICTION] * t[i] * n[j] + ratio * (eye - nn - t[i] * t[j]);
+      D[i][j] = m * select<S>(sticks, eye, slides);
+    }
+}
+
+// What the exchange did: its impulses are those of `impulses` times `scale`, with the points' w left in the crowd.
+struct Outcome {
+  double residual = 0, scale = 1;
+  Vector push;  // (nv,) what the bodies gave: their joint velocities fall by scale * push
+};
+
+// Solves for the change of the joint velocities with mass matrix M (nv, nv), from points that move with w as they would
+// without contact. `energy` is twice the points' kinetic energy.
+template <class S> Outcome exchange(Crowd<S>& crowd, const Vector& M, double energy, int iterations) {
+  const int nv = crowd.nv, packs = crowd.packs;
+  Outcome out;
+  if (nv == 0 || packs == 0) { out.push.assign(nv, 0); return out; }
+  std::vector<Pack<S>> scratch(size_t(packs) * 6 + size_t(STEPS) * nv + size_t(nv) * nv);
+  Pack<S>* free = scratch.data();            // w without contact, three rows a pack
+  Pack<S>* moved = free + 3 * size_t(packs);  // how the bodies' points move with a step
+  Pack<S>* sum = moved + 3 * size_t(packs);   // (STEPS, nv) pulls, or (nv, nv)
+  for (int k = 0; k < packs; ++k) for (int i = 0; i < 3; ++i) free[3 * k + i] = crowd.of(k)[SPEED + i];
+
+  // metric = (M + J^T m J)^-1, and what the bodies would get if all points stuck to them
+  Vector metric(nv * nv, 0), stick(nv, 0), H(M);
+  for (int a = 0; a < nv * nv; ++a) sum[a] = Pack<S>(S(0));
+  std::vector<Pack<S>> stuck(nv, Pack<S>(S(0)));
+  for (int k = 0; k < packs; ++k) {
+    const Pack<S>*p = crowd.of(k), *lever = p + LEVER;
+    for (int a = 0; a < nv; ++a) {
+      const Pack<S>* A = lever + 3 * a;
+      Rows<S> mA = {p[MASS] * A[0], p[MASS] * A[1], p[MASS] * A[2]};
+      stuck[a] = stuck[a] + mA[0] * p[SPEED] + mA[1] * p[SPEED + 1] + mA[2] * p[SPEED + 2];
+      for (int b = 0; b <= a; ++b) {
+        const Pack<S>* B = lever + 3 * b;
+        sum[a * nv + b] = sum[a * nv + b] + mA[0] * B[0] + mA[1] * B[1] + mA[2] * B[2];
+      }
+    }
+  }
+  for (int a = 0; a < nv; ++a) {
+    metric[a * nv + a] = 1;
+    stick[a] = total(stuck[a]);
+    for (int b = 0; b <= a; ++b) { double m = total(sum[a * nv + b]); H[a * nv + b] += m; if (b < a) H[b * nv + a] += m; }
+  }
+  solve(H, metric, nv, nv);
+
+  // The equation's remainder for a change of q, and its size in the metric.
+  auto left_over = [&](const Vector& change, const Pack<S>* pull, Vector& R) {
+    double square = 0;
+    for (int a = 0; a < nv; ++a) {
+      R[a] = total(pull[a]);
+      for (int b = 0; b < nv; ++b) R[a] += M[a * nv + b] * change[b];
+    }
+    for (int a = 0; a < nv; ++a) for (int b = 0; b < nv; ++b) square += R[a] * metric[b * nv + a] * R[b];
+    return std::sqrt(std::max(square, 0.0));
+  };
+
+  Vector change(nv, 0), R(nv), tried(nv), R_tried(nv), best_change(nv), best_R(nv);
+  // The best of some shares of a step, if it helps; sets what remains then. Returns whether it did.
+  double size = 0;
+  auto nearer = [&](const Vector& step, int shares) {
+    for (int j = 0; j < shares * nv; ++j) sum[j] = Pack<S>(S(0));
+    for (int k = 0; k < packs; ++k) {
+      const Pack<S>*p = crowd.of(k), *lever = p + LEVER;
+      Rows<S> dw = {Pack<S>(S(0)), Pack<S>(S(0)), Pack<S>(S(0))};
+      for (int a = 0; a < nv; ++a) for (int i = 0; i < 3; ++i) dw[i] = dw[i] + S(step[a]) * lever[3 * a + i];
+      for (int i = 0; i < 3; ++i) moved[3 * k + i] = dw[i];
+      for (int j = 0; j < shares; ++j) {
+        Rows<S> w, f;
+        for (int i = 0; i < 3; ++i) w[i] = p[SPEED + i] - S(STEP[j]) * dw[i];
+        impulses<S>(p, w, f);
+        for (int a = 0; a < nv; ++a) {
+          const Pack<S>* A = lever + 3 * a;
+          sum[j * nv + a] = sum[j * nv + a] + f[0] * A[0] + f[1] * A[1] + f[2] * A[2];
+        }
+      }
+    }
+    int best = -1;
+    double least = 0;
+    for (int j = 0; j < shares; ++j) {
+      for (int a = 0; a < nv; ++a) tried[a] = change[a] + STEP[j] * step[a];
+      const double s = left_over(tried, sum + j * nv, R_tried);
+      if (best < 0 || !(s >= least)) { best = j; least = s; best_change = tried; best_R = R_tried; }
+    }
+    if (!(least < size)) return false;
+    change = best_change; R = best_R; size = least;
+    for (int k = 0; k < packs; ++k)
+      for (int i = 0; i < 3; ++i) crowd.of(k)[SPEED + i] = crowd.of(k)[SPEED + i] - S(STEP[best]) * moved[3 * k + i];
+    return true;
+  };
+
+  size = std::numeric_limits<double>::infinity();
+  nearer(Vector(nv, 0), 1);  // no contact: only what remains of the equation is wanted
+  const double none = size, enough = SOLVED * std::numeric_limits<S>::epsilon() * none;
+  Vector step(nv, 0);
+  for (int a = 0; a < nv; ++a) for (int b = 0; b < nv; ++b) step[a] += metric[a * nv + b] * stick[b];
+  nearer(step, 1);
+  bool going = size > enough;
+  for (int it = 0; going && it < iterations; ++it) {
+    for (int j = 0; j < nv * nv; ++j) sum[j] = Pack<S>(S(0));
+    for (int k = 0; k < packs; ++k) {
+      const Pack<S>*p = crowd.of(k), *lever = p + LEVER;
+      Rows<S> w = {p[SPEED], p[SPEED + 1], p[SPEED + 2]};
+      Pack<S> D[3][3];
+      stiffness<S>(p, w, D);
+      for (int a = 0; a < nv; ++a) {
+        const Pack<S>* A = lever + 3 * a;
+        Rows<S> DA;
+        for (int i = 0; i < 3; ++i) DA[i] = D[i][0] * A[0] + D[i][1] * A[1] + D[i][2] * A[2];
+        for (int b = 0; b < nv; ++b) {
+          const Pack<S>* B = lever + 3 * b;
+          sum[b * nv + a] = sum[b * nv + a] + DA[0] * B[0] + DA[1] * B[1] + DA[2] * B[2];
+        }
+      }
+    }
+    H = M;
+    for (int j = 0; j < nv * nv; ++j) H[j] += total(sum[j]);
+    for (int a = 0; a < nv; ++a) step[a] = -R[a];
+    solve(H, step, nv, 1);
+    going = nearer(step, STEPS) && size > enough;
+  }
+
+  // Where that has not converged, impulses are scaled down until they dissipate.
+  for (int a = 0; a < nv; ++a) sum[a] = Pack<S>(S(0));
+  double work = 0, doubled = 0;
+  for (int k = 0; k < packs; ++k) {
+    const Pack<S>*p = crowd.of(k), *lever = p + LEVER;
+    Rows<S> w = {p[SPEED], p[SPEED + 1], p[SPEED + 2]}, f, before = {free[3 * k], free[3 * k + 1], free[3 * k + 2]};
+    impulses<S>(p, w, f);
+    work += total(dot<S>(f, before));
+    doubled += total(dot<S>(f, f) / select<S>(p[MASS] > S(0), p[MASS], Pack<S>(S(1))));
+    for (int a = 0; a < nv; ++a) sum[a] = sum[a] + f[0] * lever[3 * a] + f[1] * lever[3 * a + 1] + f[2] * lever[3 * a + 2];
+  }
+  out.push.resize(nv);
+  for (int a = 0; a < nv; ++a) out.push[a] = total(sum[a]);
+  Vector pulled(out.push);
+  H = M;
+  solve(H, out.push, nv, 1);
+  for (int a = 0; a < nv; ++a) doubled += pulled[a] * out.push[a];
+  const double noise = NOISE * energy;
+  if (none * none > noise) out.residual = size / std::max(none, double(std::numeric_limits<S>::min()));
+  if (std::abs(work) > noise && doubled > 0) out.scale = std::min(std::max(-work / doubled, 0.0), 1.0);
+  return out;
+}
+
+}  // namespace MPM_ISA

@@ -1,0 +1,75 @@
+// What the kernels are called with: plain pointers and numbers, so that they need no other header.
+#pragma once
+#include <cstdint>
+
+enum Law : int64_t { NO_LAW = 0, ELASTIC = 1, SAND = 2, SNOW = 3 };
+enum WallKind : int64_t { SLIP = 0, STICK = 1, SEPARATE = 2, OPEN = 3 };
+
+// The grid: node (0, ..) is at the origin; the walls' planes lie `margin` nodes inside its ends.
+struct GridShape {
+  int64_t dim, shape[3], margin, wall_kind[6];  // walls: lower and upper side of each axis
+  double wall_friction[6], cell_size;
+};
+
+// Grains to nodes. Arrays have the layout of `Particles`, `batch` of them behind each other; nodes are
+// (batch, *shape, 4): velocity after forces, gravity and walls, and mass. Where no grain reaches, only watched nodes are set.
+struct ToNodes {
+  GridShape grid;
+  int64_t batch, grains, watch;
+  const void *x, *v, *C, *tau, *m, *V0, *step;  // step: time step, gravity
+  const int32_t* watched;
+  double least_mass;
+  void* nodes;
+};
+
+// Nodes to grains: gather, move, strain, and the law's answer, in place for the slots from start to stop.
+struct ToGrains {
+  GridShape grid;
+  int64_t batch, grains, memory, start, stop, parameters;
+  Law law;
+  const void *nodes, *m, *parameter;  // parameter: time step, then the law's own
+  void *x, *v, *C, *e, *tau, *history;
+};
+
+enum GeomKind : int64_t { PLANE = 0, SPHERE = 2, CAPSULE = 3, ELLIPSOID = 4, CYLINDER = 5, BOX = 6, MESH = 7 };  // MuJoCo's
+
+// Rigid geoms, but for where they are. A mesh has nodes[3 g ..] distances in `voxels` from its `first` one on.
+struct GeomTable {
+  int64_t count;
+  const int64_t *kind, *first, *nodes;
+  const double *size, *reach, *origin, *spacing;
+  const float* voxels;
+};
+
+// Points near geoms: which of them are between `low` and their own `high` away; `room` indices, `points` where there are
+// fewer, and how many there are.
+struct Near {
+  GeomTable geoms;
+  int64_t batch, points, room;
+  double low;
+  const void *x, *high, *pos, *mat;
+  int32_t *index, *found;
+};
+
+// Points that meet bodies: those with mass and nearer than `reach` to a geom exchange momentum with them. Arrays are
+// those of coupling/meeting.py.
+struct Meet {
+  GeomTable geoms;
+  const int64_t* body_of;
+  int64_t batch, points, bodies, nv, iterations;
+  bool plane_strain;  // normals lie in the plane y = 0
+  double reach;
+  const void *x, *v, *m, *pos, *mat, *centre, *J, *d, *M, *mu, *q_free;
+  void *phi, *n, *q, *impulse, *wrench, *residual, *scale;
+};
+
+#define DECLARE(isa)                          \
+  namespace isa {                             \
+  void to_nodes(const ToNodes&, bool f64);    \
+  void to_grains(const ToGrains&, bool f64);  \
+  void near(const Near&, bool f64);           \
+  void meet(const Meet&, bool f64);           \
+  }
+DECLARE(wide)
+DECLARE(narrow)
+#undef DECLARE

@@ -1,0 +1,217 @@
+"""Grains against bodies over one rigid step: the boundary that the continuum meets in every substep."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from coupling import bodies as rigid
+from coupling.bodies import Stance
+from coupling.contact import distances
+from coupling.geoms import Shape, bounding_radius, half_extents
+from coupling.meeting import Geoms, Meeting, counted, found, meet, near
+from mpm_env.health import MOST_DEPTH, MOST_TRAVEL, Health, as_bits
+from mpm_env.mpm.types import Particles
+from mpm_env.scene import NODE_DEPTH, Scene, lift
+
+ROUNDS = 8  # in which plain XLA stops the grains inside bodies; up to an eighth of those near are inside, mostly
+HALFWAY = 0.5  # of the way to a thin geom's middle, from where a grain is about to come out on the other side
+MOST_RESIDUAL = 0.1  # share of the exchange's equation that may stay unsolved before it is called not converged
+
+
+class Touch(NamedTuple):
+    """What contact carries from substep to substep."""
+
+    q: Array  # (nv,) joint velocities as the grains see them
+    centre: Array  # (B, 3) m
+    turn: Array  # (B, 3, 3) since the start of the rigid step
+    impulse: Array  # (nv,) generalised impulse of the grains so far
+    wrench: Array  # (G, 6) impulse wrench on each geom so far, N s and N m s
+    depth: Array  # () m, deepest grain inside a body so far
+    residual: Array  # () worst share of an exchange left unsolved
+
+
+class Moves(NamedTuple):
+    """How contact moves some grains."""
+
+    grains: Array  # (K,) indices, their number where a slot is free
+    dx: Array  # (d, K) m
+    dv: Array  # (d, K) m/s
+
+
+class Contact(NamedTuple):
+    """Grains against bodies over one rigid step: a Boundary of the continuum.
+
+    The points that can come near a body are looked up once per rigid step, in buffers of fixed size; each substep only
+    visits those.
+    """
+
+    scene: Scene
+    stance: Stance
+    watched: Array  # (K,) indices into the flattened grid, its size where a slot is free
+    nodes_x: Array  # (3, K) m
+    nodes_over: Array  # () bool, more than fit
+    grains_near: Array  # (P,) indices of grains, their number where a slot is free
+    grains_over: Array  # () bool
+
+    @classmethod
+    def of(cls, scene: Scene, stance: Stance, p: Particles) -> Contact:
+        """Look up the nodes and grains near the bodies."""
+        b, dx = scene.bodies, scene.grid.cell_size
+        assert b is not None
+        g = _geoms(scene)
+        pos, mat = rigid.poses(b, stance, stance.centre, jnp.broadcast_to(jnp.eye(3), (len(b.bodies), 3, 3)))
+        nodes = scene.world(jnp.asarray(scene.grid.node_positions().T, scene.dtype))
+        band = jnp.full(nodes.shape[1:], (scene.fidelity.contact_band + MOST_TRAVEL) * dx, scene.dtype)
+        watched, over = near(g, pos, mat, nodes, -NODE_DEPTH * dx, band, scene.sizes.nodes)
+        if scene.sizes.grains and scene.slots:
+            travel = MOST_TRAVEL * dx + scene.rigid_dt * jnp.sqrt(jnp.sum(p.v * p.v, axis=0))
+            travel = jnp.where(p.m > 0, travel, -jnp.inf)
+            grains = near(g, pos, mat, scene.world(p.x), -jnp.inf, travel, scene.sizes.grains)
+        else:
+            grains = (jnp.zeros((0,), jnp.int32), jnp.zeros((), bool))
+        return cls(scene, stance, watched, nodes.at[:, watched].get(mode="clip"), over, *grains)
+
+    def start(self, q: Array) -> Touch:
+        """Nothing has happened yet; joints move with q (nv,)."""
+        B, G = self.stance.centre.shape[0], self.stance.lever.shape[0]
+        dtype = self.stance.centre.dtype
+        zero = jnp.zeros((), dtype)
+        eye = jnp.broadcast_to(jnp.eye(3, dtype=dtype), (B, 3, 3))
+        return Touch(q, self.stance.centre, eye, jnp.zeros_like(q), jnp.zeros((G, 6), dtype), zero, zero)
+
+    def nodes(self, touch: Touch, v: Array, m: Array) -> tuple[Touch, Array]:
+        """Exchange momentum between bodies and the grid nodes within the band."""
+        reach = self.scene.fidelity.contact_band * self.scene.grid.cell_size
+        free = touch.q + self.scene.mpm_dt * self.stance.acceleration
+        touch, met = self._meet(touch, free, self.nodes_x, lift(v.T), m, reach)
+        return touch, self._flatten(met.exchange.impulse / jnp.where(m > 0, m, 1)).T
+
+    def grains(self, touch: Touch, p: Particles) -> tuple[Touch, Particles]:
+        """Move the bodies, then stop grains that ended up inside them and put those back to the surface."""
+        touch = self._moved(touch)
+        if not self.grains_near.size:
+            return touch, p
+        # The native kernel passes over the grains outside by itself.
+        at_once = self.scene.kernels == "native"
+        touch, moves = self._stopped(touch, p, self.grains_near) if at_once else self._stopped_in_rounds(touch, p)
+        index, dx, dv = moves
+        return touch, replace(p, x=p.x.at[:, index].add(dx, mode="drop"), v=p.v.at[:, index].add(dv, mode="drop"))
+
+    def _stopped_in_rounds(self, touch: Touch, p: Particles) -> tuple[Touch, Moves]:
+        """Stop the grains inside bodies, some at a time.
+
+        Most substeps find few of them: then all but the first rounds, or all, are rest.
+        """
+        near, room = self.grains_near, self.grains_near.size
+        x = self.scene.world(p.x.at[:, near].get(mode="clip"))
+        b = self.scene.bodies
+        assert b is not None
+        phi = distances(b.shapes, x, *rigid.poses(b, self.stance, touch.centre, touch.turn))
+        count = counted((p.m.at[near].get(mode="fill", fill_value=0) > 0) & (phi < 0))
+        few = -(-room // ROUNDS)
+
+        def stop(touch: Touch, first: Array) -> tuple[Touch, Moves]:
+            wanted = found(count, first + jnp.arange(few, dtype=count.dtype))
+            return self._stopped(touch, p, near.at[wanted].get(mode="fill", fill_value=p.count))
+
+        def rest(touch: Touch, first: Array) -> tuple[Touch, Moves]:
+            none = jnp.zeros((self.scene.dimension, few), x.dtype)
+            return touch, Moves(jnp.full((few,), p.count, near.dtype), none, none)
+
+        firsts = few * jnp.arange(ROUNDS, dtype=count.dtype)
+        touch, moves = lax.scan(lambda touch, k: lax.cond(k < count[-1], stop, rest, touch, k), touch, firsts)
+        index, dx, dv = (jnp.moveaxis(a, 0, -2).reshape(*a.shape[1:-1], -1) for a in moves)
+        return touch, Moves(index, dx, dv)
+
+    def _stopped(self, touch: Touch, p: Particles, index: Array) -> tuple[Touch, Moves]:
+        """Stop those inside bodies among the grains with these indices (K,), and put them on the surface.
+
+        An index is the number of grains where a slot is free.
+        """
+        x, v = (a.at[:, index].get(mode="clip") for a in (p.x, p.v))
+        m = p.m.at[index].get(mode="fill", fill_value=0)
+        touch, met = self._meet(touch, touch.q, self.scene.world(x), lift(v), m, 0.0)
+        touch = touch._replace(depth=jnp.maximum(touch.depth, jnp.max(-met.phi)))
+        change = met.exchange.impulse / jnp.where(m > 0, m, 1)
+        return touch, Moves(index, self._flatten(-met.phi * met.n), self._flatten(change))
+
+    def coast(self, touch: Touch) -> Touch:
+        """A substep without any grain."""
+        return self._moved(touch._replace(q=touch.q + self.scene.mpm_dt * self.stance.acceleration))
+
+    def examined(self, touch: Touch) -> Array:
+        """Health bits of this rigid step's contact."""
+        b, dx = self.scene.bodies, self.scene.grid.cell_size
+        assert b is not None
+        twist = self.stance.J @ touch.q + self.stance.drift
+        reach = jnp.asarray([_reach(b, i) for i in range(len(b.bodies))], touch.centre.dtype)
+        speed = jnp.linalg.norm(twist[:, :3], axis=-1) + reach * jnp.linalg.norm(twist[:, 3:], axis=-1)
+        return as_bits(
+            {
+                Health.TOO_DEEP: touch.depth > min(MOST_DEPTH * dx, *(HALFWAY * _half_thickness(s) for s in b.shapes)),
+                Health.NODES_OVERFLOW: self.nodes_over,
+                Health.GRAINS_OVERFLOW: self.grains_over,
+                Health.NOT_CONVERGED: touch.residual > MOST_RESIDUAL,
+                Health.BODY_TOO_FAST: jnp.max(speed) * self.scene.rigid_dt > MOST_TRAVEL * dx,
+            }
+        )
+
+    def _meet(self, touch: Touch, free: Array, x: Array, v: Array, m: Array, reach: float) -> tuple[Touch, Meeting]:
+        """Points against the bodies where they are now, whose joints move with free (nv,) without them."""
+        b = self.scene.bodies
+        assert b is not None
+        t = rigid.twists(self.stance, touch.centre)
+        if not b.yields:  # every coupled body goes where it is told: nothing to solve
+            t = t._replace(J=t.J[:, :, :0], M=t.M[:0, :0])
+        mu = jnp.asarray(b.friction, touch.centre.dtype)
+        pos, mat = rigid.poses(b, self.stance, touch.centre, touch.turn)
+        met = meet(_geoms(self.scene), pos, mat, t, mu, free if b.yields else free[:0], x, v, m, reach)
+        done = met.exchange
+        return touch._replace(
+            q=done.q if b.yields else free,
+            impulse=touch.impulse + self._generalised(done.wrench),
+            wrench=touch.wrench + done.wrench,
+            residual=jnp.maximum(touch.residual, done.residual),
+        ), met
+
+    def _generalised(self, wrench: Array) -> Array:
+        """Generalised impulse (nv,) of the impulse wrenches (G, 6) on the geoms."""
+        assert self.scene.bodies is not None
+        return jnp.einsum("gkn,gk->n", self.stance.J[np.asarray(self.scene.bodies.body_of)], wrench)
+
+    def _moved(self, touch: Touch) -> Touch:
+        twist = self.stance.J @ touch.q + self.stance.drift
+        h = self.scene.mpm_dt
+        return touch._replace(centre=touch.centre + h * twist[:, :3], turn=rigid.turned(touch.turn, twist[:, 3:], h))
+
+    def _flatten(self, a: Array) -> Array:
+        """Rows (3, K) of space as rows (d, K) of the grid."""
+        return a if self.scene.dimension == 3 else a[::2]
+
+
+def _half_thickness(shape: Shape) -> float:
+    """Half the smallest side of a geom, m: how deep a grain can be before it is nearer to the other side."""
+    return float(np.min(half_extents(shape)))
+
+
+def _reach(b: rigid.Bodies, body: int) -> float:
+    """How far a body's coupled geoms reach from its centre of mass, m; planes count as nothing."""
+    centre = b.model.body_ipos[b.bodies[body]]
+    reaches = [
+        float(np.linalg.norm(b.model.geom_pos[g] - centre)) + bounding_radius(shape)
+        for g, shape, owner in zip(b.geoms, b.shapes, b.body_of, strict=True)
+        if owner == body
+    ]
+    return max((r for r in reaches if np.isfinite(r)), default=0.0)
+
+
+def _geoms(scene: Scene) -> Geoms:
+    """The coupled geoms, and how contact with them is computed."""
+    b, f = scene.bodies, scene.fidelity
+    assert b is not None
+    return Geoms(b.shapes, b.body_of, f.contact_iterations, scene.dimension == 2, scene.kernels)
