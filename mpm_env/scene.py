@@ -63,6 +63,7 @@ class Scene:
     mpm_dt: float  # s
     mpm_per_rigid: int
     bodies: Bodies | None
+    adhesion: tuple[float, ...]  # Pa, of each material to the bodies
     motion: Motion
     sizes: Sizes
     middle: float  # m, the slice's y in plane strain
@@ -73,6 +74,12 @@ class Scene:
     def dimension(self) -> int:
         """2 (plane strain) or 3."""
         return self.grid.dimension
+
+    @property
+    def node_volume(self) -> float:
+        """What a grid node stands for, m^3: a cell, in plane strain of the slice's thickness."""
+        thickness = self.config.box.upper[1] - self.config.box.lower[1]
+        return float(self.grid.cell_size**self.dimension * (thickness if self.dimension == 2 else 1))
 
     @property
     def slots(self) -> int:
@@ -156,7 +163,11 @@ def build(config: SceneConfig, fidelity: Fidelity) -> Scene:
     model = _model(config.bodies, fidelity, config.gravity) if config.bodies else None
     motion = Motion.of(config.bodies, model)
     mpm_per_rigid = _substeps(config, fidelity, grid, materials, motion)
-    bodies = couple(model, _coupled(config.bodies, model)) if config.bodies and model is not None else None
+    bodies = (
+        couple(model, _coupled(config.bodies, model, len(config.grains)))
+        if config.bodies and model is not None
+        else None
+    )
     middle = (config.box.lower[1] + config.box.upper[1]) / 2
     scene = Scene(
         config=config,
@@ -171,6 +182,7 @@ def build(config: SceneConfig, fidelity: Fidelity) -> Scene:
         mpm_per_rigid=mpm_per_rigid,
         bodies=bodies,
         motion=motion,
+        adhesion=_per_grains("adhesion", config.bodies.adhesion, len(config.grains)) if config.bodies else (),
         sizes=_sizes(bodies, grid, config, fidelity, at, middle) if bodies else Sizes(0, 0),
         middle=middle,
         dtype=dtype,
@@ -289,19 +301,28 @@ def _model(bodies: BodiesConfig, fidelity: Fidelity, gravity: Vec3) -> mujoco.Mj
     return model
 
 
-def _coupled(bodies: BodiesConfig, model: mujoco.MjModel) -> dict[int, float]:
-    """Ids and friction of the coupled geoms."""
+def _coupled(bodies: BodiesConfig, model: mujoco.MjModel, grains: int) -> dict[int, tuple[float, ...]]:
+    """Ids of the coupled geoms, and their friction to each of so many entries of grains."""
     names = {i: model.geom(i).name for i in range(model.ngeom)}
     known = [n for n in names.values() if n]
-    out: dict[int, float] = {}
+    out: dict[int, tuple[float, ...]] = {}
     for pattern in (*bodies.couple, *bodies.friction_of):
         if not fnmatch.filter(known, pattern):
             raise ValueError(f"The model has no geom named {pattern!r}{nearest(pattern, known)}")
     for i, name in names.items():
         if name and any(fnmatch.fnmatch(name, p) for p in bodies.couple):
             special = [mu for p, mu in bodies.friction_of.items() if fnmatch.fnmatch(name, p)]
-            out[i] = special[-1] if special else bodies.friction
+            out[i] = _per_grains("friction", special[-1] if special else bodies.friction, grains)
     return out
+
+
+def _per_grains(name: str, values: list[float], grains: int) -> tuple[float, ...]:
+    """Values for each of so many entries of grains, of which one value serves all."""
+    if len(values) not in (1, grains):
+        raise ValueError(
+            f"bodies.{name} has {len(values)} numbers for {grains} entries of grains: give one, or one each."
+        )
+    return tuple(values) if len(values) == grains else tuple(values * grains)
 
 
 def _keyframe(scene: Scene) -> tuple[np.ndarray, np.ndarray]:

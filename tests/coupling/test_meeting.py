@@ -6,8 +6,7 @@ case has, since joints that move no body change nothing: few programs are compil
 
 import itertools
 import shutil
-from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 from typing import Any, NamedTuple
 
 import jax
@@ -19,10 +18,8 @@ from scipy.spatial.transform import Rotation
 
 from coupling.exchange import Twists
 from coupling.geoms import Shape, Voxels
-from coupling.meeting import Geoms, Meeting, meet, near
+from coupling.meeting import Geoms, Meeting, meet
 from mpm_env import native
-from mpm_env.health import Health
-from tests.coupling import test_coupled as coupled
 
 FAR = 10.0  # m, a reach that all points are within
 REACH = 0.05  # m
