@@ -17,7 +17,8 @@ from coupling.meeting import Geoms, Meeting, Surfaces, counted, found, meet, nea
 from mpm_env.health import MOST_DEPTH, MOST_TRAVEL, Health, as_bits
 from mpm_env.mpm.substep import to_nodes
 from mpm_env.mpm.types import Particles
-from mpm_env.scene import NODE_DEPTH, Scene, lift
+from mpm_env.scene import Scene, lift
+from mpm_env.scene_bodies import NODE_DEPTH
 
 ROUNDS = 8  # in which plain XLA stops the grains inside bodies; up to an eighth of those near are inside, mostly
 HALFWAY = 0.5  # of the way to a thin geom's middle, from where a grain is about to come out on the other side

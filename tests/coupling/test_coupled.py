@@ -22,7 +22,8 @@ from mpm_env.config import parse
 from mpm_env.fidelity import Fidelity
 from mpm_env.health import Health, names
 from mpm_env.mpm.budgets import budgets
-from mpm_env.scene import Scene, Sizes, State, build, initial
+from mpm_env.scene import Scene, State, build, initial
+from mpm_env.scene_bodies import Sizes
 from mpm_env.scene_config import SceneConfig
 
 DX = 0.025  # m
