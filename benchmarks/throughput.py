@@ -3,7 +3,8 @@
     python -m benchmarks.throughput [--quick]
 
 Million grain-substeps per CPU second on one core, unless said. Each variant is a process of its own, so that its memory
-is known; variants take turns, and each turn has three repetitions.
+is known. The variants of a sweep take turns, one sweep after the other, so that those that are compared run within a
+minute or two of each other; each turn has three repetitions.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ def variant(n: int, **options: Any) -> list[str]:
 
 
 def sweeps(quick: bool) -> dict[str, dict[str, list[str]]]:
-    """Sweep -> variant -> options, kernels aside. The same variant in two sweeps is run once."""
+    """Sweep -> variant -> options, kernels aside."""
     sizes = SIZES[:3] if quick else SIZES
     middle, flat = (10, 64) if quick else (20, 128)
     one = variant(middle)
@@ -94,31 +95,29 @@ def main() -> None:
     a = parser.parse_args()
     own = [sys.executable, "-m", "benchmarks.column"]
     wanted = sweeps(a.quick)
-    every = {" ".join(words): words for sweep in wanted.values() for words in sweep.values()}
     heaps = {f"--n {n}": ["--n", str(n), "--tend", "0.1"] for n in (HEAPS if not a.quick else (10,))}
-    rows: dict[str, Any] = {}
     kinds, missing = kernels_here()
+    rows: dict[str, Any] = {}
+    left_out = list(missing)
+
+    def run(variants: dict[str, list[str]], rounds: int) -> dict[str, dict[str, Any]]:
+        """Kernels -> variant -> its summary."""
+        jobs = {f"{k} {name}": [*own, "--kernels", k, *words] for k in kinds for name, words in variants.items()}
+        got, failed = in_rounds(jobs, rounds, setting)
+        left_out.extend(failed)
+        return {k: {name: got[f"{k} {name}"] for name in variants if f"{k} {name}" in got} for k in kinds}
+
     with tempfile.TemporaryDirectory() as cache:  # so that a variant is compiled once, not in each round
         setting = {"JAX_COMPILATION_CACHE_DIR": cache, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
-        jobs = {f"{k}|{key}": [*own, "--kernels", k, *words] for key, words in every.items() for k in kinds}
-        got, failed = in_rounds(jobs, 1 if a.quick else ROUNDS, setting)
-        checks = {f"{k}|{key}": [*own, "--kernels", k, *words] for key, words in heaps.items() for k in kinds}
-        heaped, more = in_rounds(checks, 1, setting)
-    for sweep, variants in wanted.items():
-        rows[sweep] = {
-            k: {
-                name: got[f"{k}|{' '.join(words)}"]
-                for name, words in variants.items()
-                if f"{k}|{' '.join(words)}" in got
-            }
-            for k in kinds
-        }
+        for sweep, variants in wanted.items():
+            rows[sweep] = run(variants, 1 if a.quick else ROUNDS)
+        heaped = run(heaps, 1)
     content = {
         "quick": a.quick,
         "sweeps": rows,
         "fit": {k: fit(list(rows["size"][k].values())) for k in kinds if len(rows["size"][k]) > 1},
-        "same_job": {name.replace("|", " "): round(same_job(row), 5) for name, row in heaped.items()},
-        "left_out": [*missing, *failed, *more],
+        "same_job": {f"{k} {name}": round(same_job(row), 5) for k in kinds for name, row in heaped[k].items()},
+        "left_out": left_out,
     }
     results.write("throughput", content)
 

@@ -2,6 +2,7 @@
 // stays the reference.
 #pragma once
 #include <algorithm>
+#include <limits>
 #include <vector>
 
 #include "kernels.h"
@@ -115,7 +116,7 @@ template <class S> inline Pack<S> mesh(const Geom<S>& g, const Rows<S>& p, Pack<
     int64_t first[3];
     for (int i = 0; i < 3; ++i) {
       const S last = S(g.nodes[i] - 1), c = (x[i][l] - g.origin[i]) / g.spacing;
-      const S inside = c > 0 ? (c < last ? c : last) : S(0);  // 0 also for NaN, which the last sum brings back
+      const S inside = c > 0 ? (c < last ? c : last) : S(0);
       first[i] = std::min<int64_t>(int64_t(inside), g.nodes[i] - 2);
       part[i] = inside - S(first[i]);
       beyond[i] = x[i][l] - (g.origin[i] + g.spacing * inside);
@@ -136,7 +137,7 @@ template <class S> inline Pack<S> mesh(const Geom<S>& g, const Rows<S>& p, Pack<
           d[2] += (c ? 1 : -1) * w[0] * w[1] * at[a][b][c];
         }
     const bool out = far > S(TINY_SQUARE);
-    const S distance = out ? root(far) : S(0);
+    const S distance = far == far ? (out ? root(far) : S(0)) : far;  // NaN stays
     phi[l] = value + distance;
     for (int i = 0; i < 3; ++i) slope[i][l] = (beyond[i] == 0 ? d[i] / g.spacing : S(0)) + (out ? beyond[i] / distance : S(0));
   }
@@ -201,18 +202,19 @@ template <class S> INLINE Facing<S> nearest(const std::vector<const Geom<S>*>& g
 // Points are looked at a block at a time: most blocks are far from most geoms.
 constexpr int BLOCK_PACKS = 8;
 
-// The geoms that may be nearer than `limit` to one of some packs of points, x[pack][row]; NaN is near everything.
+// The geoms that may be nearer than `limit` to one of some packs of points, x[pack][row]. Those without a
+// place are near nothing.
 template <class S>
 INLINE void worth_a_look(const std::vector<Geom<S>>& geoms, const Rows<S>* x, int packs, S limit, std::vector<const Geom<S>*>& some) {
   some.clear();
   S low[3], high[3];
   for (int r = 0; r < 3; ++r) {
-    Pack<S> least = x[0][r], most = x[0][r];
-    for (int k = 1; k < packs; ++k) { least = select<S>(x[k][r] > least, least, x[k][r]); most = both(most, x[k][r]); }
+    Pack<S> least(std::numeric_limits<S>::infinity()), most = -least;
+    for (int k = 0; k < packs; ++k) { least = select<S>(x[k][r] < least, x[k][r], least); most = both(most, x[k][r]); }
     alignas(64) S a[W], b[W];
     least.store(a); most.store(b);
     low[r] = a[0]; high[r] = b[0];
-    for (int l = 1; l < W; ++l) { low[r] = a[l] > low[r] ? low[r] : a[l]; high[r] = b[l] > high[r] ? b[l] : high[r]; }
+    for (int l = 1; l < W; ++l) { low[r] = a[l] < low[r] ? a[l] : low[r]; high[r] = b[l] > high[r] ? b[l] : high[r]; }
   }
   for (const Geom<S>& g : geoms) {
     S far = 0;

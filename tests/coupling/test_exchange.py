@@ -219,6 +219,32 @@ def test_a_point_within_the_cone_sticks_and_one_outside_it_slides_on_the_cone() 
     np.testing.assert_allclose(rubbing[~sticks], (mu * normal)[~sticks], atol=1e-6)
 
 
+@pytest.mark.parametrize("mu", [0.0, 0.5])
+def test_a_sticky_surface_holds_a_point_up_to_its_hold_and_rubs_by_what_is_left_of_it(mu: float) -> None:
+    p, w, _ = random_law()
+    hold = np.full(len(w), 0.2)
+    f = np.asarray(impulses(as_rows(p), w.T, Surface(np.full(len(w), mu), hold)), np.float64).T
+    after = w + f / p.m[:, None]
+    apart, normal = np.sum(w * p.n, axis=1), np.sum(f * p.n, axis=1)
+    rubbing = np.linalg.norm(f - normal[:, None] * p.n, axis=1)
+    np.testing.assert_allclose(normal, np.maximum(-p.m * apart, -hold), atol=1e-6)  # float32
+    assert np.all(rubbing <= mu * (normal + hold) + 1e-6)
+    kept, torn = (apart > 0) & (p.m * apart < hold), p.m * apart > hold
+    assert kept.any() and torn.any()
+    np.testing.assert_allclose(np.sum(after * p.n, axis=1)[kept], 0, atol=1e-6)
+    assert np.max(np.sum(f * after, axis=1)) <= 1e-6, "the law gave energy"
+
+
+def test_stiffness_of_a_sticky_surface_is_the_derivative_of_its_law() -> None:
+    p, w, mu = random_law()
+    with jax.enable_x64(True):
+        law = Surface(jnp.asarray(mu), jnp.full(len(w), 0.2))
+        slope = jax.vmap(jax.jacfwd(lambda w, p, law: impulses(p, w, law)))
+        p, w = jax.tree.map(jnp.asarray, (p, w))
+        found, exact = np.moveaxis(stiffness(as_rows(p), w.T, law), -1, 0), -np.asarray(slope(w, p, law))
+    np.testing.assert_allclose(found, exact, rtol=0, atol=DERIVATIVE_TOLERANCE)
+
+
 def test_the_law_only_dissipates() -> None:
     p, w, mu = random_law()
     f = np.asarray(impulses(as_rows(p), w.T, Surface(mu)), np.float64).T
