@@ -1,4 +1,4 @@
-"""A plate pulled off a sticky block: adhesion holds it back with the stress that the scene names, and no more."""
+"""Surfaces that hold on to what touches them: up to the stress that the scene names, and no more."""
 
 from functools import partial
 
@@ -6,12 +6,15 @@ import jax
 import numpy as np
 import pytest
 
-from mpm_env import sim
+from mpm_env import native, sim
 from mpm_env.config import parse
 from mpm_env.fidelity import Fidelity
 from mpm_env.health import Health
 from mpm_env.scene import Scene, build, initial
 from mpm_env.scene_config import SceneConfig
+from tests.coupling import encounters as enc
+from tests.coupling.encounters import REACH, met
+from tests.coupling.test_meeting import assert_same, each_precision
 
 DX = 0.025  # m
 WIDTH, HALF = 0.1, 0.1  # m, of the slice, and half the plate's length
@@ -79,3 +82,21 @@ def test_a_plate_without_adhesion_comes_off_freely() -> None:
     pull, push = pulled(0.0, 0.25)
     assert push / WIDTH > LEAST_PUSH
     assert pull / (ADHESION * 2 * HALF * WIDTH) < NOTHING
+
+
+@pytest.mark.skipif(native.why_not() is not None, reason="no native kernels, whose presence test_meeting sees to")
+@each_precision
+def test_materials_have_their_own_friction_and_adhesion(dtype: str) -> None:
+    case = enc.sticky(dtype)
+    truth = met(enc.crowd("xla"), case, REACH, "float64", "batch")
+    got = met(enc.crowd("native"), case, REACH, dtype, "batch")
+    assert_same(got, truth, case, dtype)
+    pull = -np.sum(got.exchange.impulse * got.n, axis=1)
+    share = case.shares[:, 0]
+    weight = np.maximum(1 - np.abs(got.phi - (REACH - enc.LAYER)) / enc.LAYER, 0)
+    assert np.all(pull <= share * 0.05 * weight * (1 + 1e-5)), "held back by more than the surface can"
+    assert np.mean(pull > 0) > 0.1, "hardly any point is held back"
+    plain = met(
+        enc.crowd("native"), case._replace(hold=0 * case.hold, shares=case.shares[:, ::-1]), REACH, dtype, "batch"
+    )
+    assert np.abs(plain.exchange.impulse - got.exchange.impulse).max() > 0.01

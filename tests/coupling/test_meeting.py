@@ -205,23 +205,6 @@ def test_an_exchange_is_that_of_the_reference(nv: int, dtype: str) -> None:
     assert_same(native_answer(nv, dtype), truth, case, dtype)
 
 
-@each_precision
-def test_materials_have_their_own_friction_and_adhesion(dtype: str) -> None:
-    case = enc.sticky(dtype)
-    truth = met(enc.crowd("xla"), case, REACH, "float64", "batch")
-    got = met(enc.crowd("native"), case, REACH, dtype, "batch")
-    assert_same(got, truth, case, dtype)
-    pull = -np.sum(got.exchange.impulse * got.n, axis=1)
-    share = case.shares[:, 0]
-    weight = np.maximum(1 - np.abs(got.phi - (REACH - enc.LAYER)) / enc.LAYER, 0)
-    assert np.all(pull <= share * 0.05 * weight * (1 + 1e-5)), "held back by more than the surface can"
-    assert np.mean(pull > 0) > 0.1, "hardly any point is held back"
-    plain = met(
-        enc.crowd("native"), case._replace(hold=0 * case.hold, shares=case.shares[:, ::-1]), REACH, dtype, "batch"
-    )
-    assert np.abs(plain.exchange.impulse - got.exchange.impulse).max() > 0.01
-
-
 @pytest.mark.parametrize("count", enc.CROWDS)
 @each_precision
 def test_a_crowd_may_be_of_any_size(count: int, dtype: str) -> None:
