@@ -38,7 +38,7 @@ class Bodies:
     mjx_model: Any  # mjx.Model
     geoms: tuple[int, ...]  # (G) ids of coupled geoms
     shapes: tuple[Shape, ...]  # (G)
-    friction: tuple[float, ...]  # (G)
+    friction: tuple[tuple[float, ...], ...]  # (G, M) to each material
     bodies: tuple[int, ...]  # (B) ids of the bodies that carry coupled geoms
     body_of: tuple[int, ...]  # (G) index into bodies
     mocap: tuple[int, ...]  # (B) mocap id of the body it hangs on, or -1
@@ -71,8 +71,8 @@ class Stance(NamedTuple):
     acceleration: Array  # (nv,) of the joints without grains
 
 
-def couple(model: mujoco.MjModel, geoms: dict[int, float]) -> Bodies:
-    """The rigid side for a model and its coupled geoms with their friction coefficients.
+def couple(model: mujoco.MjModel, geoms: dict[int, tuple[float, ...]]) -> Bodies:
+    """The rigid side for a model and its coupled geoms with their friction coefficients to each material.
 
     Raises ValueError where MJX cannot run the model, or a geom has no signed distance.
     """

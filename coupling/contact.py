@@ -95,28 +95,39 @@ def cross(a: Array, b: Array) -> Array:
     return jnp.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
-def impulses(p: Points, w: Array, mu: Array) -> Array:
-    """Impulses (3, .., K) N s on points that move with w (3, .., K) m/s relative to their body, friction mu (K,).
+class Surface(NamedTuple):
+    """How the bodies' surface is to each point."""
 
-    A point that separates gets none. One that approaches loses its approach and, by Coulomb's bound on the tangential
-    impulse, all or part of its sliding.
+    mu: Array  # (K,) Coulomb's coefficient of friction
+    hold: Array | float = 0.0  # (K,) N s, the most that the surface pulls on a point that leaves: adhesion
+
+
+def impulses(p: Points, w: Array, surface: Surface) -> Array:
+    """Impulses (3, .., K) N s on points that move with w (3, .., K) m/s relative to their body.
+
+    A point that separates gets none, or where the surface is sticky as much as keeps it, up to the hold. One that
+    approaches loses its approach. By Coulomb's bound on the tangential impulse, mu times the normal one beyond the
+    pull that the surface can give, it loses all or part of its sliding. The law only dissipates.
     """
-    approach = jnp.maximum(-dot(w, p.n), 0)
+    approach = -dot(w, p.n)
     w_t = [a + approach * n for a, n in zip(w, p.n, strict=True)]
-    held = jnp.minimum(1, mu * approach / jnp.sqrt(dot(w_t, w_t) + TINY))
-    touching = jnp.where(approach > 0, p.m, 0)
-    push, hold = once((touching * (1 - held) * approach, touching * held))
-    return jnp.stack([push * n - hold * a for a, n in zip(w, p.n, strict=True)])
+    normal = jnp.maximum(p.m * approach, -surface.hold)
+    bound = surface.mu * (normal + surface.hold)
+    held = jnp.minimum(p.m, bound / jnp.sqrt(dot(w_t, w_t) + TINY))
+    push, held = once((normal - held * approach, held))
+    return jnp.stack([push * n - held * a for a, n in zip(w, p.n, strict=True)])
 
 
-def stiffness(p: Points, w: Array, mu: Array) -> Array:
+def stiffness(p: Points, w: Array, surface: Surface) -> Array:
     """Derivative (3, 3, K) kg of minus the impulses with respect to w: what one more m/s of approach would cost."""
-    approach = jnp.maximum(-dot(w, p.n), 0)
+    approach = -dot(w, p.n)
     w_t = w + approach * p.n
     speed = jnp.sqrt(dot(w_t, w_t) + TINY)
-    ratio = mu * approach / speed
+    touching = p.m * approach > -surface.hold
+    normal = jnp.maximum(p.m * approach, -surface.hold)
+    rub = surface.mu * (normal + surface.hold) / speed  # kg
     t = w_t / speed
     eye = jnp.eye(3, dtype=w.dtype)[..., None]
     nn, tt, tn = p.n[:, None] * p.n, t[:, None] * t, t[:, None] * p.n
-    slide = nn - mu * tn + ratio * (eye - nn - tt)
-    return jnp.where(approach > 0, p.m, 0) * jnp.where(ratio >= 1, eye, slide)
+    m = jnp.where(touching, p.m, 0)
+    return jnp.where(rub >= p.m, m * nn + p.m * (eye - nn), m * (nn - surface.mu * tn) + rub * (eye - nn - tt))

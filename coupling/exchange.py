@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from coupling.contact import Points, cross, impulses, stiffness
+from coupling.contact import Points, Surface, cross, impulses, stiffness
 from coupling.geoms import dot, once
 
 STEPS = (1.0, 0.5, 0.25, 0.0625)  # line search candidates: full Newton steps where they help, small ones at kinks
@@ -47,19 +47,20 @@ class Exchange(NamedTuple):
     scale: Array  # () factor that kept the impulses dissipative, 1 when converged
 
 
-def exchange(p: Points, t: Twists, q_free: Array, mu: Array, body_of: tuple[int, ...], iterations: int) -> Exchange:
+def exchange(
+    p: Points, t: Twists, q_free: Array, surface: Surface, body_of: tuple[int, ...], iterations: int
+) -> Exchange:
     """Impulses between points p and bodies t from the velocity q_free (nv,) that the bodies would have without them.
 
-    mu (G,) is the friction coefficient of each geom, body_of the body of each geom. No iterations are made when no
-    coupled body can yield (nv == 0): then the law is explicit.
+    body_of is the body of each geom. No iterations are made when no coupled body can yield (nv == 0): then the law is
+    explicit.
     """
     body = jnp.asarray(body_of, jnp.int32)[p.geom]
-    friction = mu[p.geom]
     r = p.x - t.centre.T[:, body]
     w = p.v - _at(t.d.T[:, body], r)
     nv = t.M.shape[0]
     if nv == 0:
-        f = impulses(p, w, friction)
+        f = impulses(p, w, surface)
         zero = jnp.zeros((), p.v.dtype)
         return Exchange(q_free, f, _per_geom(f, p, r, len(body_of)), zero, zero + 1)
     # How the body's points under the grid points move with q: (3, nv, K).
@@ -79,7 +80,7 @@ def exchange(p: Points, t: Twists, q_free: Array, mu: Array, body_of: tuple[int,
 
     def best(changes: Array, w: Array) -> Newton:
         """The best of n changes (n, nv), with which points move with w (3, n, K) relative to their body."""
-        R = changes @ t.M.T + pull(impulses(p, w, friction))
+        R = changes @ t.M.T + pull(impulses(p, w, surface))
         size = jnp.sqrt(jnp.maximum(jnp.sum((R @ metric) * R, axis=-1), 0))
         i = jnp.argmin(size)
         return Newton(changes[i], w[:, i], R[i], size[i], jnp.ones((), bool))
@@ -96,7 +97,7 @@ def exchange(p: Points, t: Twists, q_free: Array, mu: Array, body_of: tuple[int,
         return new._replace(going=helps & (new.size > enough))
 
     def newton(_: int, at: Newton) -> Newton:
-        D = stiffness(p, at.w, friction)
+        D = stiffness(p, at.w, surface)
         H = t.M + pull(jnp.stack([dot(row[:, None], lever) for row in D])).T
         return nearer(at, -jnp.linalg.solve(H, at.R), jnp.asarray(STEPS, at.R.dtype))
 
@@ -104,7 +105,7 @@ def exchange(p: Points, t: Twists, q_free: Array, mu: Array, body_of: tuple[int,
     at = nearer(none, stuck, jnp.ones((1,), stuck.dtype))
     at = at._replace(going=at.size > enough)
     at = jax.lax.fori_loop(0, iterations, lambda i, at: jax.lax.cond(at.going, newton, lambda _, at: at, i, at), at)
-    f = impulses(p, at.w, friction)
+    f = impulses(p, at.w, surface)
     pulled = pull(f[:, None])[0]
     push = jnp.linalg.solve(t.M, pulled)  # what the bodies give: q = q_free - push
     work = jnp.sum(f * w_free)

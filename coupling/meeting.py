@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from coupling.contact import Points, distances, nearest_geom
+from coupling.contact import Points, Surface, distances, nearest_geom
 from coupling.exchange import Exchange, Twists, exchange
 from coupling.geoms import Shape, bounding_radius, dot
 from mpm_env import native
@@ -28,6 +28,7 @@ class Geoms(NamedTuple):
     shapes: tuple[Shape, ...]
     body_of: tuple[int, ...]  # of each geom
     iterations: int  # of the exchange, at most
+    layer: float  # m, thickness of the layer of points that adhesion is shared among: a grid cell
     plane_strain: bool  # normals lie in the plane y = 0
     kernels: str  # "native" or "xla"
 
@@ -56,25 +57,40 @@ def near(g: Geoms, pos: Array, mat: Array, x: Array, low: float, high: Array, ro
     return pick((phi > low) & (phi < high), room)
 
 
+class Surfaces(NamedTuple):
+    """How the geoms' surfaces are to each of M materials."""
+
+    mu: Array  # (G, M) friction of each geom
+    hold: Array  # (M,) N s, the most that a layer of points at full weight is held back by: adhesion
+    shares: Array | None  # (M, K) of the materials in each point; None where there is one material
+
+
 def meet(
-    g: Geoms, pos: Array, mat: Array, t: Twists, mu: Array, q_free: Array, x: Array, v: Array, m: Array, reach: float
+    g: Geoms, pos: Array, mat: Array, t: Twists, s: Surfaces, q_free: Array, x: Array, v: Array, m: Array, reach: float
 ) -> Meeting:
     """Points x (3, K) m with velocities v (3, K) m/s and masses m (K,) kg against the bodies.
 
     Those with mass and nearer than `reach` to a geom take part in the exchange, see `exchange`; geoms stand at
-    pos (G, 3) m with axes mat (G, 3, 3) and have friction mu (G,).
+    pos (G, 3) m with axes mat (G, 3, 3). Adhesion is shared among the points of one layer beneath the reach, so that
+    those in line with each other add up to one at full weight.
     """
 
-    def reference(pos: Array, mat: Array, t: Twists, mu: Array, q_free: Array, x: Array, v: Array, m: Array) -> Meeting:
+    def reference(
+        pos: Array, mat: Array, t: Twists, s: Surfaces, q_free: Array, x: Array, v: Array, m: Array
+    ) -> Meeting:
         phi, n, geom = nearest_geom(g.shapes, x, pos, mat)
         if g.plane_strain:
             n = n.at[1].set(0)
             n = n / jnp.maximum(jnp.sqrt(dot(n, n)), LEAST_NORMAL)
         meets = (m > 0) & (phi < reach)
-        done = exchange(Points(x, v, jnp.where(meets, m, 0), phi, n, geom), t, q_free, mu, g.body_of, g.iterations)
+        shares = jnp.ones((1, 1), x.dtype) if s.shares is None else s.shares
+        weight = jnp.maximum(1 - jnp.abs(phi - (reach - g.layer)) / g.layer, 0)
+        surface = Surface(dot(s.mu[geom].T, shares), weight * dot(s.hold, shares))
+        points = Points(x, v, jnp.where(meets, m, 0), phi, n, geom)
+        done = exchange(points, t, q_free, surface, g.body_of, g.iterations)
         return Meeting(jnp.where(meets, phi, reach), jnp.where(meets, n, 0), done)
 
-    def kernel(pos: Array, mat: Array, t: Twists, mu: Array, q_free: Array, x: Array, v: Array, m: Array) -> Meeting:
+    def kernel(pos: Array, mat: Array, t: Twists, s: Surfaces, q_free: Array, x: Array, v: Array, m: Array) -> Meeting:
         shapes = (m.shape, x.shape, q_free.shape, x.shape, (len(g.shapes), 6), (1,), (1,))
         call = jax.ffi.ffi_call(
             "mpm_env_meet", [jax.ShapeDtypeStruct(s, x.dtype) for s in shapes], vmap_method="broadcast_all"
@@ -84,13 +100,15 @@ def meet(
             "iterations": np.int64(g.iterations),
             "plane_strain": g.plane_strain,
             "within": np.float64(reach),
+            "layer": np.float64(g.layer),
         }
-        arrays = (x, v, m, pos, mat, t.centre, t.J, t.d, t.M, mu, q_free)
+        shares = jnp.zeros((0, 0), x.dtype) if s.shares is None else s.shares
+        arrays = (x, v, m, pos, mat, t.centre, t.J, t.d, t.M, s.mu, s.hold, shares, q_free)
         phi, n, q, impulse, wrench, residual, scale = call(*arrays, _voxels(g), **_table(g), **attributes)
         return Meeting(phi, n, Exchange(q, impulse, wrench, residual[0], scale[0]))
 
     either = native.differentiable(kernel, reference) if g.kernels == "native" else reference
-    return either(pos, mat, t, mu, q_free, x, v, m)
+    return either(pos, mat, t, s, q_free, x, v, m)
 
 
 def pick(mask: Array, room: int) -> tuple[Array, Array]:

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import base64
-import fnmatch
 import math
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 from jax import Array
 
-from coupling.bodies import Bodies, couple, points_near, refresh, start
+from coupling.bodies import Bodies, refresh, start
 from coupling.contact import nearest_geom
-from coupling.geoms import bounding_radius
 from mpm_env import native
 from mpm_env.config import nearest
 from mpm_env.fidelity import Fidelity
@@ -29,23 +25,13 @@ from mpm_env.mpm.stability import courant_limit, largest_dt
 from mpm_env.mpm.substep import Bed
 from mpm_env.mpm.transfer import CHUNK
 from mpm_env.mpm.types import Grid, Particles, Wall
+from mpm_env.scene_bodies import Sizes, bodies_of, model_of, per_grains, sizes_of
 from mpm_env.scene_cache import keep_programs
-from mpm_env.scene_config import BodiesConfig, SceneConfig, Vec3
+from mpm_env.scene_config import SceneConfig
 from mpm_env.scene_grains import WHOLE, axes_of, fill_of, material_of, whole
 
 SORTED_FROM = 65_536  # grains; fewer cost the same in any order that flow brings about
-CROWDED = 1.5  # grains near a tool may be packed this much denser than at the start
-ICE = 917.0  # kg/m^3, beyond which no snow is packed
-ROOM = 1.3  # how many more nodes than counted at the start may be near a tool, for how it turns and lies in the grid
-NODE_DEPTH = 2.0  # cells inside a body down to which nodes are looked at: deeper ones carry no grains
 OVERLAP = 0.25  # cells that a grain may start inside a body: the jitter of seeding, not a mistake
-
-
-class Sizes(NamedTuple):
-    """Static sizes of the buffers for points near bodies."""
-
-    nodes: int
-    grains: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +49,7 @@ class Scene:
     mpm_dt: float  # s
     mpm_per_rigid: int
     bodies: Bodies | None
+    adhesion: tuple[float, ...]  # Pa, of each material to the bodies
     motion: Motion
     sizes: Sizes
     middle: float  # m, the slice's y in plane strain
@@ -73,6 +60,12 @@ class Scene:
     def dimension(self) -> int:
         """2 (plane strain) or 3."""
         return self.grid.dimension
+
+    @property
+    def node_volume(self) -> float:
+        """What a grid node stands for, m^3: a cell, in plane strain of the slice's thickness."""
+        thickness = self.config.box.upper[1] - self.config.box.lower[1]
+        return float(self.grid.cell_size**self.dimension * (thickness if self.dimension == 2 else 1))
 
     @property
     def slots(self) -> int:
@@ -153,10 +146,10 @@ def build(config: SceneConfig, fidelity: Fidelity) -> Scene:
         chunked = -(-count // CHUNK) * CHUNK
         spans.append((at, at + chunked))
         at += chunked
-    model = _model(config.bodies, fidelity, config.gravity) if config.bodies else None
+    model = model_of(config.bodies, fidelity, config.gravity) if config.bodies else None
     motion = Motion.of(config.bodies, model)
     mpm_per_rigid = _substeps(config, fidelity, grid, materials, motion)
-    bodies = couple(model, _coupled(config.bodies, model)) if config.bodies and model is not None else None
+    bodies = bodies_of(config, model, grid, fidelity) if model is not None else None
     middle = (config.box.lower[1] + config.box.upper[1]) / 2
     scene = Scene(
         config=config,
@@ -171,7 +164,8 @@ def build(config: SceneConfig, fidelity: Fidelity) -> Scene:
         mpm_per_rigid=mpm_per_rigid,
         bodies=bodies,
         motion=motion,
-        sizes=_sizes(bodies, grid, config, fidelity, at, middle) if bodies else Sizes(0, 0),
+        adhesion=per_grains("adhesion", config.bodies.adhesion, len(config.grains)) if config.bodies else (),
+        sizes=sizes_of(bodies, grid, config, fidelity, at, middle) if bodies else Sizes(0, 0),
         middle=middle,
         dtype=dtype,
         kernels=native.chosen(fidelity.kernels),
@@ -278,32 +272,6 @@ def _fitting_cells(config: SceneConfig, fidelity: Fidelity) -> str:
     return " or ".join(map(str, sorted(fits, key=lambda n: abs(n - fidelity.cells))[:2])) or "none (change the box)"
 
 
-def _model(bodies: BodiesConfig, fidelity: Fidelity, gravity: Vec3) -> mujoco.MjModel:
-    assets = {name: base64.b64decode(text) for name, text in bodies.assets.items()}
-    try:
-        model = mujoco.MjModel.from_xml_string(bodies.mjcf, assets)
-    except ValueError as error:
-        raise ValueError(f"bodies.mjcf is not a model that MuJoCo can read: {' '.join(str(error).split())}") from None
-    model.opt.timestep = fidelity.rigid_dt
-    model.opt.gravity[:] = gravity  # the scene's, so that grains and bodies fall alike
-    return model
-
-
-def _coupled(bodies: BodiesConfig, model: mujoco.MjModel) -> dict[int, float]:
-    """Ids and friction of the coupled geoms."""
-    names = {i: model.geom(i).name for i in range(model.ngeom)}
-    known = [n for n in names.values() if n]
-    out: dict[int, float] = {}
-    for pattern in (*bodies.couple, *bodies.friction_of):
-        if not fnmatch.filter(known, pattern):
-            raise ValueError(f"The model has no geom named {pattern!r}{nearest(pattern, known)}")
-    for i, name in names.items():
-        if name and any(fnmatch.fnmatch(name, p) for p in bodies.couple):
-            special = [mu for p, mu in bodies.friction_of.items() if fnmatch.fnmatch(name, p)]
-            out[i] = special[-1] if special else bodies.friction
-    return out
-
-
 def _keyframe(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     """Joint positions (nq,) and velocities (nv,) at the start: the named keyframe's, or the model's pose at rest."""
     assert scene.bodies is not None and scene.config.bodies is not None
@@ -351,20 +319,6 @@ def _substeps(config: SceneConfig, f: Fidelity, grid: Grid, materials: tuple[Mat
         )
     longest = min(f.courant * grid.cell_size / wave if wave else f.rigid_dt, bound.dt, f.rigid_dt)
     return math.ceil(f.rigid_dt / longest - WHOLE)
-
-
-def _sizes(bodies: Bodies, grid: Grid, config: SceneConfig, f: Fidelity, slots: int, middle: float) -> Sizes:
-    """Room for the nodes and grains near bodies: their shells' volume, MOST_TRAVEL added for one rigid step."""
-    snow = [ICE / g.material.rho for g in config.grains if g.material.model == "snow"]
-    crowded = max([CROWDED, *snow])
-    dx = grid.cell_size
-    slice_at = middle if grid.dimension == 2 else None
-    infinite = any(not np.isfinite(bounding_radius(s)) for s in bodies.shapes)
-    bands = (-NODE_DEPTH * dx, (f.contact_band + MOST_TRAVEL) * dx), (-MOST_TRAVEL * dx, MOST_TRAVEL * dx)
-    shell, near = points_near(bodies, bands, dx, middle=slice_at)
-    nodes = grid.nodes if infinite else min(grid.nodes, int(ROOM * shell) + 64)
-    grains = slots if infinite else min(slots, int(crowded * near * f.particles_per_axis**grid.dimension) + 64)
-    return Sizes(nodes, grains if f.push_out else 0)
 
 
 def _refuse_overlap(scene: Scene) -> None:

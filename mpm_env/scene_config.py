@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from mpm_env.config import Section, find, nearest, overlay, parse, read_yaml
 
@@ -138,6 +138,11 @@ class Waypoint(Section):
     quaternion: Quaternion | None = None  # w x y z; None keeps the model's
 
 
+PerGrains = Annotated[
+    list[NotNegative], Field(min_length=1), BeforeValidator(lambda v: v if isinstance(v, list | tuple) else [v])
+]
+
+
 class BodiesConfig(Section):
     """A MuJoCo model and what of it meets the grains."""
 
@@ -146,8 +151,10 @@ class BodiesConfig(Section):
     mjcf: str
     assets: dict[str, str] = {}  # mesh and texture files the model needs, base64; filled when a file is read
     couple: Annotated[list[str], Field(min_length=1)]  # names or patterns of the coupled geoms
-    friction: NotNegative = 0.4  # between coupled geoms and grains
-    friction_of: dict[str, NotNegative] = {}  # pattern -> friction, where it differs
+    # Numbers below are for all grains, or a list with one for each entry of `grains`.
+    friction: PerGrains = [0.4]  # between coupled geoms and grains
+    friction_of: dict[str, PerGrains] = {}  # pattern -> friction, where it differs
+    adhesion: PerGrains = [0.0]  # Pa, the pull at which grains come off the coupled geoms: cohesive snow, wet sand
     keyframe: str | None = None  # joint positions and velocities at the start
     controls: dict[str, list[tuple[NotNegative, float]]] = {}  # actuator -> (t, value), joined by a monotone cubic
     motion: dict[str, Annotated[list[Waypoint], Field(min_length=1)]] = {}  # mocap body -> waypoints

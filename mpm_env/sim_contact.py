@@ -13,10 +13,12 @@ from coupling import bodies as rigid
 from coupling.bodies import Stance
 from coupling.contact import distances
 from coupling.geoms import Shape, bounding_radius, half_extents
-from coupling.meeting import Geoms, Meeting, counted, found, meet, near
+from coupling.meeting import Geoms, Meeting, Surfaces, counted, found, meet, near
 from mpm_env.health import MOST_DEPTH, MOST_TRAVEL, Health, as_bits
+from mpm_env.mpm.substep import to_nodes
 from mpm_env.mpm.types import Particles
-from mpm_env.scene import NODE_DEPTH, Scene, lift
+from mpm_env.scene import Scene, lift
+from mpm_env.scene_bodies import NODE_DEPTH
 
 ROUNDS = 8  # in which plain XLA stops the grains inside bodies; up to an eighth of those near are inside, mostly
 HALFWAY = 0.5  # of the way to a thin geom's middle, from where a grain is about to come out on the other side
@@ -57,6 +59,7 @@ class Contact(NamedTuple):
     nodes_over: Array  # () bool, more than fit
     grains_near: Array  # (P,) indices of grains, their number where a slot is free
     grains_over: Array  # () bool
+    shares: Array | None  # (M, K) of the materials in the nodes' mass; None where bodies treat all alike
 
     @classmethod
     def of(cls, scene: Scene, stance: Stance, p: Particles) -> Contact:
@@ -74,7 +77,8 @@ class Contact(NamedTuple):
             grains = near(g, pos, mat, scene.world(p.x), -jnp.inf, travel, scene.sizes.grains)
         else:
             grains = (jnp.zeros((0,), jnp.int32), jnp.zeros((), bool))
-        return cls(scene, stance, watched, nodes.at[:, watched].get(mode="clip"), over, *grains)
+        x = nodes.at[:, watched].get(mode="clip")
+        return cls(scene, stance, watched, x, over, *grains, _shares(scene, p, watched))
 
     def start(self, q: Array) -> Touch:
         """Nothing has happened yet; joints move with q (nv,)."""
@@ -88,7 +92,10 @@ class Contact(NamedTuple):
         """Exchange momentum between bodies and the grid nodes within the band."""
         reach = self.scene.fidelity.contact_band * self.scene.grid.cell_size
         free = touch.q + self.scene.mpm_dt * self.stance.acceleration
-        touch, met = self._meet(touch, free, self.nodes_x, lift(v.T), m, reach)
+        # A layer of nodes stands for a cell's width of surface each.
+        area = self.scene.node_volume / self.scene.grid.cell_size
+        surfaces = self._surfaces(self.shares, np.asarray(self.scene.adhesion) * area * self.scene.mpm_dt)
+        touch, met = self._meet(touch, surfaces, free, self.nodes_x, lift(v.T), m, reach)
         return touch, self._flatten(met.exchange.impulse / jnp.where(m > 0, m, 1)).T
 
     def grains(self, touch: Touch, p: Particles) -> tuple[Touch, Particles]:
@@ -135,7 +142,11 @@ class Contact(NamedTuple):
         """
         x, v = (a.at[:, index].get(mode="clip") for a in (p.x, p.v))
         m = p.m.at[index].get(mode="fill", fill_value=0)
-        touch, met = self._meet(touch, touch.q, self.scene.world(x), lift(v), m, 0.0)
+        own = None
+        if self.shares is not None:
+            own = jnp.stack([((index >= a) & (index < b)).astype(x.dtype) for a, b in self.scene.spans])
+        surfaces = self._surfaces(own, np.zeros(len(self.scene.spans)))  # what holds grains back, holds the nodes
+        touch, met = self._meet(touch, surfaces, touch.q, self.scene.world(x), lift(v), m, 0.0)
         touch = touch._replace(depth=jnp.maximum(touch.depth, jnp.max(-met.phi)))
         change = met.exchange.impulse / jnp.where(m > 0, m, 1)
         return touch, Moves(index, self._flatten(-met.phi * met.n), self._flatten(change))
@@ -161,16 +172,25 @@ class Contact(NamedTuple):
             }
         )
 
-    def _meet(self, touch: Touch, free: Array, x: Array, v: Array, m: Array, reach: float) -> tuple[Touch, Meeting]:
+    def _surfaces(self, shares: Array | None, hold: np.ndarray) -> Surfaces:
+        """How bodies are to points with these shares (M, K) of the materials, held back by up to hold (M,) N s."""
+        b = self.scene.bodies
+        assert b is not None
+        count = slice(None) if shares is not None else slice(1)
+        dtype = self.scene.dtype
+        return Surfaces(jnp.asarray(b.friction, dtype)[:, count], jnp.asarray(hold[count], dtype), shares)
+
+    def _meet(
+        self, touch: Touch, surfaces: Surfaces, free: Array, x: Array, v: Array, m: Array, reach: float
+    ) -> tuple[Touch, Meeting]:
         """Points against the bodies where they are now, whose joints move with free (nv,) without them."""
         b = self.scene.bodies
         assert b is not None
         t = rigid.twists(self.stance, touch.centre)
         if not b.yields:  # every coupled body goes where it is told: nothing to solve
             t = t._replace(J=t.J[:, :, :0], M=t.M[:0, :0])
-        mu = jnp.asarray(b.friction, touch.centre.dtype)
         pos, mat = rigid.poses(b, self.stance, touch.centre, touch.turn)
-        met = meet(_geoms(self.scene), pos, mat, t, mu, free if b.yields else free[:0], x, v, m, reach)
+        met = meet(_geoms(self.scene), pos, mat, t, surfaces, free if b.yields else free[:0], x, v, m, reach)
         done = met.exchange
         return touch._replace(
             q=done.q if b.yields else free,
@@ -214,4 +234,21 @@ def _geoms(scene: Scene) -> Geoms:
     """The coupled geoms, and how contact with them is computed."""
     b, f = scene.bodies, scene.fidelity
     assert b is not None
-    return Geoms(b.shapes, b.body_of, f.contact_iterations, scene.dimension == 2, scene.kernels)
+    return Geoms(b.shapes, b.body_of, f.contact_iterations, scene.grid.cell_size, scene.dimension == 2, scene.kernels)
+
+
+def _shares(scene: Scene, p: Particles, watched: Array) -> Array | None:
+    """Shares (M, K) of the materials in the mass of watched nodes, if bodies treat materials differently."""
+    assert scene.bodies is not None
+    if len(set(scene.adhesion)) <= 1 and all(len(set(mu)) <= 1 for mu in scene.bodies.friction):
+        return None
+    gravity = jnp.asarray(scene.gravity, scene.dtype)
+
+    def mass(span: tuple[int, int]) -> Array:
+        slots = jnp.arange(p.count)
+        some = replace(p, m=jnp.where((slots >= span[0]) & (slots < span[1]), p.m, 0))
+        nodes = to_nodes(scene.grid, some, scene.mpm_dt, gravity, watched, scene.kernels)
+        return nodes.reshape(-1, nodes.shape[-1]).at[watched, -1].get(mode="fill", fill_value=0)
+
+    m = jnp.stack([mass(span) for span in scene.spans])
+    return m / jnp.maximum(jnp.sum(m, axis=0), jnp.finfo(m.dtype).tiny)

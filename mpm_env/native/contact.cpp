@@ -57,7 +57,8 @@ template <class S> void run(const Meet& t, int64_t b) {
   const int64_t K = t.points, G = t.geoms.count, B = t.bodies, nv = t.nv;
   const S *v = (const S*)t.v + b * 3 * K, *m = (const S*)t.m + b * K;
   const S *centre = (const S*)t.centre + b * 3 * B, *J = (const S*)t.J + b * 6 * B * nv, *d = (const S*)t.d + b * 6 * B;
-  const S *M = (const S*)t.M + b * nv * nv, *mu = (const S*)t.mu + b * G, *q_free = (const S*)t.q_free + b * nv;
+  const S *M = (const S*)t.M + b * nv * nv, *mu = (const S*)t.mu + b * G * t.materials, *q_free = (const S*)t.q_free + b * nv;
+  const S *most = (const S*)t.hold + b * t.materials, *shares = (const S*)t.shares + b * t.materials * K;
   S *phi = (S*)t.phi + b * K, *n = (S*)t.n + b * 3 * K, *impulse = (S*)t.impulse + b * 3 * K;
   const auto geoms = placed<S>(t.geoms, (const S*)t.pos + b * 3 * G, (const S*)t.mat + b * 9 * G);
   std::fill_n(phi, K, S(t.reach));
@@ -120,7 +121,15 @@ template <class S> void run(const Meet& t, int64_t b) {
       mine[(SPEED + c) * W] = w;
     }
     mine[MASS * W] = m[i];
-    mine[FRICTION * W] = mu[g];
+    const S weight = std::max(S(1) - std::abs(phi[i] - S(t.reach - t.layer)) / S(t.layer), S(0));
+    S friction = 0, hold = 0;
+    for (int64_t k = 0; k < t.materials; ++k) {
+      const S share = t.materials == 1 ? S(1) : shares[k * K + i];
+      friction += share * mu[g * t.materials + k];
+      hold += share * weight * most[k];
+    }
+    mine[FRICTION * W] = friction;
+    mine[HOLD * W] = hold;
   }
 
   const Outcome done = exchange<S>(crowd, Vector(M, M + nv * nv), energy, int(t.iterations));

@@ -47,47 +47,45 @@ inline void solve(Vector& A, Vector& B, int n, int columns) {
     }
 }
 
+enum CrowdRow { NORMAL = 0, SPEED = 3, MASS = 6, FRICTION = 7, HOLD = 8, LEVER = 9 };
+
 // Points against bodies, packed: sixteen at a time, the last ones without mass.
 template <class S> struct Crowd {
   int packs, nv;
-  std::vector<Pack<S>> row;  // a pack's rows behind each other: normal, w, mass, friction, and 3 nv of lever
+  std::vector<Pack<S>> row;  // a pack's rows behind each other, in the order of CrowdRow; of the lever 3 nv
 
-  Crowd(int packs, int nv) : packs(packs), nv(nv), row(size_t(packs) * (8 + 3 * nv), Pack<S>(S(0))) {}
-  INLINE Pack<S>* of(int k) { return row.data() + size_t(k) * (8 + 3 * nv); }
+  Crowd(int packs, int nv) : packs(packs), nv(nv), row(size_t(packs) * (LEVER + 3 * nv), Pack<S>(S(0))) {}
+  INLINE Pack<S>* of(int k) { return row.data() + size_t(k) * (LEVER + 3 * nv); }
   INLINE S* at(int64_t i) { return reinterpret_cast<S*>(of(int(i / W))) + i % W; }  // of one point, to fill it
 };
-enum CrowdRow { NORMAL = 0, SPEED = 3, MASS = 6, FRICTION = 7, LEVER = 8 };
-
-// The inelastic contact with Coulomb friction: impulses f on points that move with w relative to their bodies.
+// The inelastic contact with Coulomb friction and adhesion: impulses f on points that move with w relative to their bodies.
 template <class S> INLINE void impulses(const Pack<S>* p, const Rows<S>& w, Rows<S>& f) {
-  const Pack<S> zero(S(0));
-  const Pack<S>* n = p + NORMAL;
-  Pack<S> approach = both(-(w[0] * n[0] + w[1] * n[1] + w[2] * n[2]), zero);
+  const Pack<S>*n = p + NORMAL, m = p[MASS], hold = p[HOLD];
+  Pack<S> approach = -(w[0] * n[0] + w[1] * n[1] + w[2] * n[2]), normal = both(m * approach, -hold);
   Rows<S> slide;
   for (int i = 0; i < 3; ++i) slide[i] = w[i] + approach * n[i];
-  Pack<S> held = p[FRICTION] * approach / root(dot<S>(slide, slide) + S(TINY));
-  held = smallest(held, S(1));
-  Pack<S> touching = select<S>(approach > S(0), p[MASS], zero);
-  Pack<S> push = touching * (S(1) - held) * approach, hold = touching * held;
-  for (int i = 0; i < 3; ++i) f[i] = push * n[i] - hold * w[i];
+  Pack<S> held = p[FRICTION] * (normal + hold) / root(dot<S>(slide, slide) + S(TINY));
+  held = select<S>(held > m, m, held);
+  Pack<S> push = normal - held * approach;
+  for (int i = 0; i < 3; ++i) f[i] = push * n[i] - held * w[i];
 }
 
 // Derivative (3, 3) of minus the impulses by w.
 template <class S> INLINE void stiffness(const Pack<S>* p, const Rows<S>& w, Pack<S> D[3][3]) {
   const Pack<S> zero(S(0)), one(S(1));
-  const Pack<S>* n = p + NORMAL;
-  Pack<S> approach = both(-(w[0] * n[0] + w[1] * n[1] + w[2] * n[2]), zero);
+  const Pack<S>*n = p + NORMAL, hold = p[HOLD];
+  Pack<S> approach = -(w[0] * n[0] + w[1] * n[1] + w[2] * n[2]), normal = both(p[MASS] * approach, -hold);
   Rows<S> t;
   for (int i = 0; i < 3; ++i) t[i] = w[i] + approach * n[i];
-  Pack<S> speed = root(dot<S>(t, t) + S(TINY)), ratio = p[FRICTION] * approach / speed;
+  Pack<S> speed = root(dot<S>(t, t) + S(TINY)), rub = p[FRICTION] * (normal + hold) / speed;
   for (int i = 0; i < 3; ++i) t[i] = t[i] / speed;
-  Pack<S> m = select<S>(approach > S(0), p[MASS], zero);
-  Bits<S> sticks = ratio >= S(1);
+  Pack<S> m = select<S>(p[MASS] * approach > -hold, p[MASS], zero);
+  Bits<S> sticks = rub >= p[MASS];
   for (int i = 0; i < 3; ++i)
     for (int j = 0; j < 3; ++j) {
       Pack<S> eye = i == j ? one : zero, nn = n[i] * n[j];
-      Pack<S> slides = nn - p[FRICTION] * t[i] * n[j] + ratio * (eye - nn - t[i] * t[j]);
-      D[i][j] = m * select<S>(sticks, eye, slides);
+      Pack<S> slides = m * (nn - p[FRICTION] * t[i] * n[j]) + rub * (eye - nn - t[i] * t[j]);
+      D[i][j] = select<S>(sticks, m * nn + p[MASS] * (eye - nn), slides);
     }
 }
 

@@ -113,11 +113,12 @@ ffi::Error near(ffi::AnyBuffer x, ffi::AnyBuffer high, ffi::AnyBuffer pos, ffi::
 
 ffi::Error meet(ffi::AnyBuffer x, ffi::AnyBuffer v, ffi::AnyBuffer m, ffi::AnyBuffer pos, ffi::AnyBuffer mat,
                 ffi::AnyBuffer centre, ffi::AnyBuffer J, ffi::AnyBuffer d, ffi::AnyBuffer M, ffi::AnyBuffer mu,
-                ffi::AnyBuffer q_free, ffi::AnyBuffer voxels, ffi::Result<ffi::AnyBuffer> phi,
+                ffi::AnyBuffer hold, ffi::AnyBuffer shares, ffi::AnyBuffer q_free, ffi::AnyBuffer voxels, ffi::Result<ffi::AnyBuffer> phi,
                 ffi::Result<ffi::AnyBuffer> n, ffi::Result<ffi::AnyBuffer> q, ffi::Result<ffi::AnyBuffer> impulse,
                 ffi::Result<ffi::AnyBuffer> wrench, ffi::Result<ffi::AnyBuffer> residual,
                 ffi::Result<ffi::AnyBuffer> scale, Ints kind, Ints first, Ints nodes, Floats size, Floats reach,
-                Floats origin, Floats spacing, Ints body_of, int64_t iterations, bool plane_strain, double within) {
+                Floats origin, Floats spacing, Ints body_of, int64_t iterations, bool plane_strain, double within,
+                double layer) {
   Meet t{};
   t.geoms = geoms_of(kind, first, nodes, size, reach, origin, spacing, voxels);
   t.body_of = body_of.begin();
@@ -125,13 +126,15 @@ ffi::Error meet(ffi::AnyBuffer x, ffi::AnyBuffer v, ffi::AnyBuffer m, ffi::AnyBu
   t.points = x.dimensions().back();
   t.bodies = centre.dimensions()[centre.dimensions().size() - 2];
   t.nv = q_free.dimensions().back();
+  t.materials = hold.dimensions().back();
   t.iterations = iterations;
   t.plane_strain = plane_strain;
   t.reach = within;
+  t.layer = layer;
   t.x = x.untyped_data(); t.v = v.untyped_data(); t.m = m.untyped_data();
   t.pos = pos.untyped_data(); t.mat = mat.untyped_data(); t.centre = centre.untyped_data();
   t.J = J.untyped_data(); t.d = d.untyped_data(); t.M = M.untyped_data();
-  t.mu = mu.untyped_data(); t.q_free = q_free.untyped_data();
+  t.mu = mu.untyped_data(); t.hold = hold.untyped_data(); t.shares = shares.untyped_data(); t.q_free = q_free.untyped_data();
   t.phi = phi->untyped_data(); t.n = n->untyped_data(); t.q = q->untyped_data();
   t.impulse = impulse->untyped_data(); t.wrench = wrench->untyped_data();
   t.residual = residual->untyped_data(); t.scale = scale->untyped_data();
@@ -157,9 +160,11 @@ XLA_FFI_DEFINE_HANDLER_SYMBOL(mpm_env_to_grains, to_grains,
 XLA_FFI_DEFINE_HANDLER_SYMBOL(mpm_env_near, near,
                               ffi::Ffi::Bind().ARG.ARG.ARG.ARG.ARG.RET.RET GEOM_ATTRIBUTES.Attr<double>("low"));
 XLA_FFI_DEFINE_HANDLER_SYMBOL(mpm_env_meet, meet,
-                              ffi::Ffi::Bind().ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.RET.RET.RET.RET.RET.RET.RET
+                              ffi::Ffi::Bind().ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.RET.RET.RET.RET.RET
+                                  .RET.RET
                                   GEOM_ATTRIBUTES.Attr<Ints>("body_of").Attr<int64_t>("iterations")
-                                  .Attr<bool>("plane_strain").Attr<double>("within"));
+                                  .Attr<bool>("plane_strain").Attr<double>("within")
+                                  .Attr<double>("layer"));
 
 // Read through ctypes before anything is registered.
 extern "C" {

@@ -56,10 +56,10 @@ struct Near {
 struct Meet {
   GeomTable geoms;
   const int64_t* body_of;
-  int64_t batch, points, bodies, nv, iterations;
+  int64_t batch, points, bodies, nv, materials, iterations;
   bool plane_strain;  // normals lie in the plane y = 0
-  double reach;
-  const void *x, *v, *m, *pos, *mat, *centre, *J, *d, *M, *mu, *q_free;
+  double reach, layer;
+  const void *x, *v, *m, *pos, *mat, *centre, *J, *d, *M, *mu, *hold, *shares, *q_free;
   void *phi, *n, *q, *impulse, *wrench, *residual, *scale;
 };
 

@@ -11,7 +11,7 @@ from mpm_env.scene_config import resolve
 from mpm_env.scene_grains import whole
 from mpm_env.tasks.dig import Dig
 from mpm_env.tasks.episode import Episode, reset, step
-from mpm_env.tasks.protocol import Task, TaskConfig, Tool
+from mpm_env.tasks.protocol import Task, TaskConfig
 from mpm_env.tasks.push import Push
 
 TASKS: dict[str, Any] = {"dig": Dig, "push": Push}
@@ -52,4 +52,4 @@ def make_task(config: TaskConfig | str, fidelity: Fidelity | str | None = None) 
     return TASKS[config.model](config, build(config.scene, fidelity))
 
 
-__all__ = ["TASKS", "Dig", "Episode", "Push", "Task", "TaskConfig", "Tool", "make_task", "read_task", "reset", "step"]
+__all__ = ["TASKS", "Dig", "Episode", "Push", "Task", "TaskConfig", "make_task", "read_task", "reset", "step"]

@@ -15,14 +15,13 @@ from mpm_env.mpm.budgets import height_map
 from mpm_env.scene import Scene, State, initial
 from mpm_env.tasks.protocol import (
     TaskConfig,
-    Tool,
-    geom_wrench,
     in_body,
     kilograms,
     moved_targets,
     site_twist,
     within,
 )
+from mpm_env.wrench import Wrench, wrench_at
 
 BED_TOP = 0.20  # m, mean height of the bed
 BED_UNTIL = 0.82  # m, x where the partition begins
@@ -82,7 +81,7 @@ class Dig:
         """Joint targets after an action, inside the actuators' ranges."""
         return moved_targets(self, state, action)
 
-    def observation(self, state: State, tool: Tool) -> dict[str, Array]:
+    def observation(self, state: State, tool: Wrench) -> dict[str, Array]:
         """See the class."""
         d = state.rigid
         body, tip = self._ids
@@ -122,7 +121,7 @@ class Dig:
             "edge_x_m": state.rigid.site_xpos[tip][0],
         }
 
-    def terms(self, facts: dict[str, Array], tool: Tool) -> dict[str, Array]:
+    def terms(self, facts: dict[str, Array], tool: Wrench) -> dict[str, Array]:
         """approach: the edge over the bed. load: bucket and bin against target. lift: load brought up or
         delivered. deliver: bin against target. keep: nothing spilled. gentle: low forces."""
         target = self.config.target_kg
@@ -143,9 +142,9 @@ class Dig:
         """The target mass is in the bin."""
         return facts["bin_kg"] >= self.config.target_kg
 
-    def wrench(self, state: State, reaction: Array) -> Tool:
+    def wrench(self, state: State, reaction: Array) -> Wrench:
         """The bucket's wrench from the reactions on its geoms."""
-        return geom_wrench(self.scene, state, reaction, "wrench")
+        return wrench_at(self.scene, state, reaction, "wrench")
 
     def script(self) -> list[tuple[float, np.ndarray]]:
         """One dig at a good place."""

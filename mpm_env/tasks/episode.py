@@ -13,7 +13,8 @@ from jax import Array
 from mpm_env.health import Health
 from mpm_env.scene import State
 from mpm_env.sim import Drive, advance
-from mpm_env.tasks.protocol import Task, Tool
+from mpm_env.tasks.protocol import Task
+from mpm_env.wrench import Wrench
 
 
 @partial(
@@ -43,7 +44,7 @@ class Episode:
     reward: Array  # () float32, in [0, 1]
     terms: dict[str, Array]  # () each, in [0, 1]
     facts: dict[str, Array]  # () each
-    tool: Tool
+    tool: Wrench
     terminated: Array  # () bool, the goal is reached
     truncated: Array  # () bool, out of time or unwell
 

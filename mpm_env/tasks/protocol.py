@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, ClassVar, NamedTuple, Protocol
+from typing import Annotated, Any, ClassVar, Protocol
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +12,7 @@ from pydantic import Field
 from mpm_env.config import Section
 from mpm_env.scene import Scene, State
 from mpm_env.scene_config import SceneConfig
+from mpm_env.wrench import Wrench
 
 
 class TaskConfig(Section):
@@ -23,13 +24,6 @@ class TaskConfig(Section):
     control_dt: Annotated[float, Field(gt=0)] = 0.1  # s between actions
     time_limit: Annotated[float, Field(gt=0)]  # s, then the episode is truncated
     scene: SceneConfig
-
-
-class Tool(NamedTuple):
-    """Bodies' answer, over the last action: what the grains did to the tool."""
-
-    force: Array  # (3,) N in world axes, mean over the action
-    torque: Array  # (3,) N m about the tool's wrench site, world axes, mean over the action
 
 
 class Task(Protocol):
@@ -52,37 +46,23 @@ class Task(Protocol):
     def targets(self, state: State, action: Array) -> Array:
         """Actuator targets (nu,) that the action (a,) asks for by the end of its time."""
 
-    def observation(self, state: State, tool: Tool) -> dict[str, Array]:
+    def observation(self, state: State, tool: Wrench) -> dict[str, Array]:
         """Named observations."""
 
     def facts(self, state: State) -> dict[str, Array]:
         """Scalars worth a plot: masses in kg, lengths in m."""
 
-    def terms(self, facts: dict[str, Array], tool: Tool) -> dict[str, Array]:
+    def terms(self, facts: dict[str, Array], tool: Wrench) -> dict[str, Array]:
         """Reward terms, each in [0, 1]."""
 
     def success(self, facts: dict[str, Array]) -> Array:
         """Whether the goal is reached, () bool."""
 
-    def wrench(self, state: State, reaction: Array) -> Tool:
-        """The tool's wrench from the reactions (G, 6) on the coupled geoms."""
+    def wrench(self, state: State, reaction: Array) -> Wrench:
+        """What the grains did to the tool, in world axes, from the mean reactions (G, 6) on the coupled geoms."""
 
     def script(self) -> list[tuple[float, np.ndarray]]:
         """A scripted solution: (time s, actuator targets (nu,))."""
-
-
-def geom_wrench(scene: Scene, state: State, reaction: Array, site: str) -> Tool:
-    """Force and torque about a site from the reactions (G, 6) on the coupled geoms that share the site's body.
-
-    Reactions come about their body's centre of mass; a wrench about another point gains the lever times the force.
-    """
-    bodies = scene.bodies
-    assert bodies is not None
-    at = bodies.model.site(site)
-    mine = np.asarray([bodies.model.geom_bodyid[g] == at.bodyid[0] for g in bodies.geoms])
-    wrench = jnp.sum(jnp.where(mine[:, None], reaction, 0), axis=0)
-    lever = (state.rigid.xipos[at.bodyid[0]] - state.rigid.site_xpos[at.id]).astype(reaction.dtype)
-    return Tool(wrench[:3], wrench[3:] + jnp.cross(lever, wrench[:3]))
 
 
 def moved_targets(task: Task, state: State, action: Array) -> Array:

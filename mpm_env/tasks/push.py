@@ -14,7 +14,8 @@ from scipy.interpolate import PchipInterpolator
 
 from mpm_env.mpm.budgets import height_map
 from mpm_env.scene import Scene, State, initial
-from mpm_env.tasks.protocol import TaskConfig, Tool, geom_wrench, kilograms, moved_targets, site_twist, within
+from mpm_env.tasks.protocol import TaskConfig, kilograms, moved_targets, site_twist, within
+from mpm_env.wrench import Wrench, wrench_at
 
 GOAL_LOWER, GOAL_UPPER = (0.80, -0.20), (1.15, 0.20)  # m
 PILE_UNTIL = 0.55  # m, x beyond which no grain starts
@@ -73,7 +74,7 @@ class Push:
         """Joint targets after an action, inside the actuators' ranges."""
         return moved_targets(self, state, action)
 
-    def observation(self, state: State, tool: Tool) -> dict[str, Array]:
+    def observation(self, state: State, tool: Wrench) -> dict[str, Array]:
         """See the class."""
         d = state.rigid
         body, edge = self._ids
@@ -115,7 +116,7 @@ class Push:
             "reach_m": jnp.linalg.norm(middle[:2] - at[:2]),
         }
 
-    def terms(self, facts: dict[str, Array], tool: Tool) -> dict[str, Array]:
+    def terms(self, facts: dict[str, Array], tool: Wrench) -> dict[str, Array]:
         """approach: blade near the pile. progress: pile's middle on its way. deliver: goal against target. keep: little
         left behind or lost. gentle: low forces."""
         target = self.config.target_kg
@@ -131,9 +132,9 @@ class Push:
         """The target mass is in the goal."""
         return facts["goal_kg"] >= self.config.target_kg
 
-    def wrench(self, state: State, reaction: Array) -> Tool:
+    def wrench(self, state: State, reaction: Array) -> Wrench:
         """The blade's wrench, wings included, from the reactions on its geoms."""
-        return geom_wrench(self.scene, state, reaction, "wrench")
+        return wrench_at(self.scene, state, reaction, "wrench")
 
     def script(self) -> list[tuple[float, np.ndarray]]:
         """One straight push."""

@@ -14,31 +14,40 @@ from scipy.spatial.transform import Rotation
 
 from coupling.exchange import Twists
 from coupling.geoms import Shape, Voxels
-from coupling.meeting import Geoms, Meeting, meet, near
+from coupling.meeting import Geoms, Meeting, Surfaces, meet, near
 
 
 class Case(NamedTuple):
-    """What `meet` is given, in its order; numpy in float64."""
+    """What `meet` is given; numpy in float64."""
 
     pos: Any  # (G, 3) m
     mat: Any  # (G, 3, 3)
     t: Twists
-    mu: Any  # (G,)
+    mu: Any  # (G,) or, with more than one material, (G, M)
     q_free: Any  # (nv,) m/s
     x: Any  # (3, K) m
     v: Any  # (3, K) m/s
     m: Any  # (K,) kg
+    hold: Any = np.zeros(())  # () or (M,) N s
+    shares: Any = None  # (M, K)
+
+
+def encounter(g: Geoms, case: Case, reach: float) -> Meeting:
+    """The points of a case meet its bodies."""
+    mu, hold = case.mu.reshape(len(g.shapes), -1), jnp.atleast_1d(jnp.asarray(case.hold, case.x.dtype))
+    surfaces = Surfaces(mu, hold, case.shares)
+    return meet(g, case.pos, case.mat, case.t, surfaces, case.q_free, case.x, case.v, case.m, reach)
 
 
 def in_precision(numbers: Any, dtype: str) -> Any:
     """Numbers as that precision stores them, so that inputs are not counted as errors."""
-    return jax.tree.map(lambda a: a.astype(dtype).astype(np.float64), numbers)
+    return jax.tree.map(lambda a: np.asarray(a).astype(dtype).astype(np.float64), numbers)
 
 
 @cache
 def program(g: Geoms, reach: float, how: str) -> Any:
     def one(case: Case) -> Meeting:
-        return meet(g, *case, reach)
+        return encounter(g, case, reach)
 
     return jax.jit({"one": one, "batch": jax.vmap(one), "map": lambda cases: jax.lax.map(one, cases)}[how])
 
@@ -62,6 +71,7 @@ TIPS = {
     "box": SIZE,
     "mesh": (-0.14, 0, 0),
 }  # m, where geoms that end reach farthest from their middle
+LAYER = 0.05  # m, that adhesion is shared in
 EACH = 125  # points around each geom: no multiple of 16, nor is eight times it
 PITCH = 1.5  # m between geoms that stand apart
 FAR = 10.0  # m, a reach that all points are within
@@ -91,7 +101,7 @@ def shapes() -> tuple[Shape, ...]:
 @cache
 def geoms(kernels: str, plane_strain: bool = False) -> Geoms:
     """All of them on one body without joints."""
-    return Geoms(shapes(), tuple(0 for _ in KINDS), 0, plane_strain, kernels)
+    return Geoms(shapes(), tuple(0 for _ in KINDS), 0, LAYER, plane_strain, kernels)
 
 
 @cache
@@ -149,7 +159,7 @@ def alone(geom: int, x: np.ndarray, turn: np.ndarray | None = None) -> tuple[Geo
     """One of the geoms in the middle, turned or not, among points x (3, N) m, for `near`."""
     mat = (np.eye(3) if turn is None else turn)[None]
     case = around("apart")._replace(pos=np.zeros((1, 3)), mat=mat, x=x)
-    return Geoms((shapes()[geom],), (0,), 0, False, "native"), case
+    return Geoms((shapes()[geom],), (0,), 0, LAYER, False, "native"), case
 
 
 def listed(phi: np.ndarray, low: float, high: np.ndarray, room: int) -> np.ndarray:
@@ -210,7 +220,9 @@ class Encounters(NamedTuple):
 def crowd(kernels: str, iterations: int = 6) -> Geoms:
     """Three balls and three boxes on three bodies."""
     ball, box = Shape(2, (RADIUS, 0, 0)), Shape(6, tuple(HALF))
-    return Geoms(tuple(ball if g in BALLS else box for g in range(len(BODY_OF))), BODY_OF, iterations, False, kernels)
+    return Geoms(
+        tuple(ball if g in BALLS else box for g in range(len(BODY_OF))), BODY_OF, iterations, LAYER, False, kernels
+    )
 
 
 @cache
@@ -293,6 +305,16 @@ def few(dtype: str) -> tuple[list[Case], list[Meeting]]:
     return cases, solved(cases)
 
 
+@cache
+def sticky(dtype: str) -> Case:
+    """The free body before points of two materials, one of which it holds on to; one for every mass ratio and so on."""
+    case, rng = encounters(6).case, np.random.default_rng(8)
+    share = rng.random((len(case.q_free), 1, len(FACED)))
+    mu = case.mu[..., None] * np.array([1.0, 0.3])
+    hold = np.tile([0.05, 0.0], (len(mu), 1))
+    return in_precision(case._replace(mu=mu, hold=hold, shares=np.concatenate([share, 1 - share], axis=1)), dtype)
+
+
 def sliding(nv: int) -> tuple[Geoms, Case]:
     """Points that all slide over a ball, none near a kink of the law."""
     rng = np.random.default_rng(5)
@@ -302,7 +324,7 @@ def sliding(nv: int) -> tuple[Geoms, Case]:
     t = Twists(np.zeros((1, 3)), 0.3 * rng.normal(size=(1, 6, nv)), 0.1 * rng.normal(size=(1, 6)), 3 * np.eye(nv))
     q = rng.normal(scale=0.2, size=nv)
     case = Case(np.zeros((1, 3)), np.eye(3)[None], t, np.full(1, 0.3), q, 0.11 * n.T, v.T, rng.uniform(0.1, 1, 9))
-    return Geoms((Shape(2, (RADIUS, 0, 0)),), (0,), 3, False, "native"), case
+    return Geoms((Shape(2, (RADIUS, 0, 0)),), (0,), 3, LAYER, False, "native"), case
 
 
 @cache

@@ -110,7 +110,7 @@ def model_of(xml: str) -> mujoco.MjModel:
 
 
 def coupled(model: mujoco.MjModel, *names: str) -> Bodies:
-    return couple(model, {model.geom(n).id: 0.4 for n in names})
+    return couple(model, {model.geom(n).id: (0.4,) for n in names})
 
 
 def at_rest(b: Bodies) -> Any:

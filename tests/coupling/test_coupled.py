@@ -15,14 +15,15 @@ import numpy as np
 import pytest
 
 from coupling import meeting
-from coupling.contact import Points
+from coupling.contact import Points, Surface
 from coupling.exchange import Exchange, Twists, exchange
 from mpm_env import sim
 from mpm_env.config import parse
 from mpm_env.fidelity import Fidelity
 from mpm_env.health import Health, names
 from mpm_env.mpm.budgets import budgets
-from mpm_env.scene import Scene, Sizes, State, build, initial
+from mpm_env.scene import Scene, State, build, initial
+from mpm_env.scene_bodies import Sizes
 from mpm_env.scene_config import SceneConfig
 
 DX = 0.025  # m
@@ -298,9 +299,11 @@ def test_a_light_box_lies_still_in_sand() -> None:
 def test_explicit_contact_would_throw_the_light_box_out(monkeypatch: pytest.MonkeyPatch) -> None:
     """Negative control: the same scene, law and momentum, but impulses at the velocity without contact."""
 
-    def explicit(p: Points, t: Twists, q_free: jax.Array, mu: jax.Array, body_of: tuple[int, ...], _: int) -> Exchange:
+    def explicit(
+        p: Points, t: Twists, q_free: jax.Array, surface: Surface, body_of: tuple[int, ...], _: int
+    ) -> Exchange:
         as_told = t._replace(J=t.J[:, :, :0], M=t.M[:0, :0], d=t.J @ q_free + t.d)
-        done = exchange(p, as_told, q_free[:0], mu, body_of, 0)
+        done = exchange(p, as_told, q_free[:0], surface, body_of, 0)
         pull = jnp.einsum("gkn,gk->n", t.J[np.asarray(body_of)], done.wrench)
         return done._replace(q=q_free + jnp.linalg.solve(t.M, pull))
 

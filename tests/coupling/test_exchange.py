@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from coupling.contact import Points, impulses, stiffness
+from coupling.contact import Points, Surface, impulses, stiffness
 from coupling.exchange import Exchange, Twists, exchange
 
 POINTS = 120
@@ -108,7 +108,7 @@ CHAIN_BODIES = (0, 1, 1)
 @cache
 def solver(body_of: tuple[int, ...], iterations: int) -> Any:
     def one(i: Instance) -> Exchange:
-        done = exchange(as_rows(i.p), *i[1:], body_of, iterations)
+        done = exchange(as_rows(i.p), i.t, i.q_free, Surface(i.mu[i.p.geom]), body_of, iterations)
         return done._replace(impulse=done.impulse.T)
 
     return jax.jit(jax.vmap(one))
@@ -184,9 +184,11 @@ def random_law(count: int = 400) -> tuple[Points, np.ndarray, np.ndarray]:
 def test_stiffness_is_the_derivative_of_the_law() -> None:
     p, w, mu = random_law()
     with jax.enable_x64(True):
-        slope = jax.vmap(jax.jacfwd(lambda w, p, mu: impulses(p, w, mu)))  # of one point, whose rows are numbers
+        slope = jax.vmap(
+            jax.jacfwd(lambda w, p, mu: impulses(p, w, Surface(mu)))
+        )  # of one point, whose rows are numbers
         p, w, mu = jax.tree.map(jnp.asarray, (p, w, mu))
-        found, exact = np.moveaxis(stiffness(as_rows(p), w.T, mu), -1, 0), -np.asarray(slope(w, p, mu))
+        found, exact = np.moveaxis(stiffness(as_rows(p), w.T, Surface(mu)), -1, 0), -np.asarray(slope(w, p, mu))
     np.testing.assert_allclose(found, exact, rtol=0, atol=DERIVATIVE_TOLERANCE)
     free = ~exact.any(axis=(1, 2))
     sticking = np.abs(exact - np.asarray(p.m)[:, None, None] * np.eye(3)).max(axis=(1, 2)) < DERIVATIVE_TOLERANCE
@@ -195,7 +197,7 @@ def test_stiffness_is_the_derivative_of_the_law() -> None:
 
 def test_a_point_that_leaves_is_let_go() -> None:
     p, w, mu = random_law()
-    f = np.asarray(impulses(as_rows(p), w.T, mu)).T
+    f = np.asarray(impulses(as_rows(p), w.T, Surface(mu))).T
     leaves = np.sum(w * p.n, axis=1) > 0
     assert leaves.any()
     assert not f[leaves].any()
@@ -205,7 +207,7 @@ def test_a_point_that_leaves_is_let_go() -> None:
 def test_a_point_within_the_cone_sticks_and_one_outside_it_slides_on_the_cone() -> None:
     p, w, mu = random_law()
     p, w, mu = jax.tree.map(lambda a: a[np.sum(w * p.n, axis=1) < 0], (p, w, mu))
-    f = np.asarray(impulses(as_rows(p), w.T, mu), np.float64).T
+    f = np.asarray(impulses(as_rows(p), w.T, Surface(mu)), np.float64).T
     after = w + f / p.m[:, None]
     approach = -np.sum(w * p.n, axis=1)
     sticks = mu * approach > np.linalg.norm(w + approach[:, None] * p.n, axis=1)
@@ -217,9 +219,35 @@ def test_a_point_within_the_cone_sticks_and_one_outside_it_slides_on_the_cone() 
     np.testing.assert_allclose(rubbing[~sticks], (mu * normal)[~sticks], atol=1e-6)
 
 
+@pytest.mark.parametrize("mu", [0.0, 0.5])
+def test_a_sticky_surface_holds_a_point_up_to_its_hold_and_rubs_by_what_is_left_of_it(mu: float) -> None:
+    p, w, _ = random_law()
+    hold = np.full(len(w), 0.2)
+    f = np.asarray(impulses(as_rows(p), w.T, Surface(np.full(len(w), mu), hold)), np.float64).T
+    after = w + f / p.m[:, None]
+    apart, normal = np.sum(w * p.n, axis=1), np.sum(f * p.n, axis=1)
+    rubbing = np.linalg.norm(f - normal[:, None] * p.n, axis=1)
+    np.testing.assert_allclose(normal, np.maximum(-p.m * apart, -hold), atol=1e-6)  # float32
+    assert np.all(rubbing <= mu * (normal + hold) + 1e-6)
+    kept, torn = (apart > 0) & (p.m * apart < hold), p.m * apart > hold
+    assert kept.any() and torn.any()
+    np.testing.assert_allclose(np.sum(after * p.n, axis=1)[kept], 0, atol=1e-6)
+    assert np.max(np.sum(f * after, axis=1)) <= 1e-6, "the law gave energy"
+
+
+def test_stiffness_of_a_sticky_surface_is_the_derivative_of_its_law() -> None:
+    p, w, mu = random_law()
+    with jax.enable_x64(True):
+        law = Surface(jnp.asarray(mu), jnp.full(len(w), 0.2))
+        slope = jax.vmap(jax.jacfwd(lambda w, p, law: impulses(p, w, law)))
+        p, w = jax.tree.map(jnp.asarray, (p, w))
+        found, exact = np.moveaxis(stiffness(as_rows(p), w.T, law), -1, 0), -np.asarray(slope(w, p, law))
+    np.testing.assert_allclose(found, exact, rtol=0, atol=DERIVATIVE_TOLERANCE)
+
+
 def test_the_law_only_dissipates() -> None:
     p, w, mu = random_law()
-    f = np.asarray(impulses(as_rows(p), w.T, mu), np.float64).T
+    f = np.asarray(impulses(as_rows(p), w.T, Surface(mu)), np.float64).T
     after = w + f / p.m[:, None]
     assert np.max(np.sum(after**2 - w**2, axis=1)) <= 1e-6  # float32
     assert np.max(np.sum(f * after, axis=1)) <= 1e-6

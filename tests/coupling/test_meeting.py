@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from coupling.meeting import Meeting, meet, near
+from coupling.meeting import Meeting, near
 from mpm_env import native, sim
 from mpm_env.health import Health
 from tests.coupling import encounters as enc
@@ -333,12 +333,12 @@ def test_derivatives_are_those_of_the_reference_and_of_the_kernel(nv: int) -> No
     rng = np.random.default_rng(6)
 
     def value(kernels: str, weights: Meeting, case: Case) -> Any:
-        done = meet(g._replace(kernels=kernels), *case, REACH)
+        done = enc.encounter(g._replace(kernels=kernels), case, REACH)
         return sum(jnp.sum(w * a) for w, a in zip(jax.tree.leaves(weights), jax.tree.leaves(done), strict=True))
 
     with jax.enable_x64(True):
         case, way = jax.tree.map(jnp.asarray, (case, jax.tree.map(lambda a: rng.normal(size=a.shape), case)))
-        shapes = jax.eval_shape(lambda case: meet(g, *case, REACH), case)
+        shapes = jax.eval_shape(lambda case: enc.encounter(g, case, REACH), case)
         weights = jax.tree.map(lambda a: jnp.asarray(rng.normal(size=a.shape)), shapes)
         values = [partial(value, kernels, weights) for kernels in ("native", "xla")]
         slopes = [float(jax.jit(lambda c, w, f=f: jax.jvp(f, (c,), (w,))[1])(case, way)) for f in values]

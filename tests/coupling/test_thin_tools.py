@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from coupling import bodies as rigid
-from mpm_env import sim, sim_contact
+from mpm_env import scene_bodies, sim, sim_contact
 from mpm_env.config import parse
 from mpm_env.fidelity import Fidelity
 from mpm_env.health import Health
@@ -58,7 +58,9 @@ def bed(push_out: bool) -> Scene:
         "grains": [{"material": SAND, "fill": [{"shape": "box", "lower": (0, 0, 0), "upper": (LENGTH, WIDTH, DEPTH)}]}],
         "bodies": {"mjcf": f"<mujoco><worldbody>{blades}</worldbody></mujoco>", "couple": ["*"], "friction": 0.4},
     }
-    return build(parse(SceneConfig, config, "test"), Fidelity(cells=4, rigid_dt=DT, push_out=push_out))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scene_bodies, "THINNEST_BY_GRID", 0.0)  # else the negative control would be refused
+        return build(parse(SceneConfig, config, "test"), Fidelity(cells=4, rigid_dt=DT, push_out=push_out))
 
 
 @cache

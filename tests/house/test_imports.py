@@ -28,6 +28,7 @@ FLOORS = {
     "mpm_env.motion": 2,
     "mpm_env.scene": 2,
     "mpm_env.sim": 2,
+    "mpm_env.wrench": 2,
     "mpm_env.tasks": 3,
     "mpm_env.cli": 4,
     "mpm_env.demo": 4,

@@ -92,6 +92,21 @@ REFUSED: dict[str, tuple[dict[str, Any], dict[str, Any], tuple[str, ...]]] = {
         DRAFT,
         ("no geom named 'wegde'", "did you mean 'wedge'?"),
     ),
+    "friction for materials that are not there": (
+        {"bodies": {"friction": [0.2, 0.3]}},
+        DRAFT,
+        ("bodies.friction has 2 numbers for 1 entries of grains", "give one, or one each"),
+    ),
+    "adhesion for materials that are not there": (
+        {"bodies": {"adhesion": [1.0, 2.0, 3.0]}},
+        DRAFT,
+        ("bodies.adhesion has 3 numbers for 1 entries of grains",),
+    ),
+    "a tool too thin for the grid": (
+        {"bodies": {}},
+        {"cells": 3, "push_out": False},
+        ("The geom 'paddle' is", "cells thick", "leak through geoms thinner than 2", "push_out = true"),
+    ),
     "unknown actuator": (
         {"bodies": {"controls": {"driv": [[0, 1]]}}},
         DRAFT,
