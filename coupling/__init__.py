@@ -6,4 +6,5 @@ Knows MuJoCo and MJX, no grains: it is handed points with a mass and a velocity,
     bodies     which geoms couple, where they are over one rigid step, and the rigid step itself
     contact    points against geoms: distance, normal, and the law of separation, sticking and sliding
     exchange   the impulses between points and bodies, solved together with the joint-space mass matrix
+    meeting    both for many points at once, in JAX or by the native kernels: what a substep calls
 """

@@ -1,4 +1,4 @@
-"""Points against rigid geoms: who is near, and the law of an inelastic contact with Coulomb friction.
+"""Points against rigid geoms: how far and which way, and the law of an inelastic contact with Coulomb friction.
 
 Many points are rows (3, K): with their axis last they are computed side by side.
 """

@@ -224,6 +224,13 @@ def half_extents(shape: Shape) -> np.ndarray:
     return np.array(BOUNDS[shape.kind](*shape.size)[0])
 
 
+def thickness(shape: Shape) -> float:
+    """Smallest side of the bounding box, m; of a mesh, whose walls are thinner than it, twice its deepest voxel."""
+    if shape.voxels is not None:
+        return -2 * float(shape.voxels.values.min())
+    return 2 * float(np.min(half_extents(shape)))
+
+
 def centre(shape: Shape) -> np.ndarray:
     """Centre (3,) m of the bounding box in the geom's frame: the frame's origin, but for meshes."""
     if shape.voxels is not None:

@@ -30,7 +30,7 @@ class Geoms(NamedTuple):
     iterations: int  # of the exchange, at most
     layer: float  # m, thickness of the layer of points that adhesion is shared among: a grid cell
     plane_strain: bool  # normals lie in the plane y = 0
-    kernels: str  # "native" or "xla"
+    kernels: str  # "native" or "xla", as `native.chosen` says
 
 
 class Meeting(NamedTuple):

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from coupling.bodies import Bodies, couple, points_near
-from coupling.geoms import bounding_radius, half_extents
+from coupling.geoms import bounding_radius, thickness
 from mpm_env.config import nearest
 from mpm_env.fidelity import Fidelity
 from mpm_env.health import MOST_TRAVEL
@@ -47,7 +47,7 @@ def bodies_of(config: SceneConfig, model: mujoco.MjModel, grid: Grid, f: Fidelit
     assert config.bodies is not None
     b = couple(model, _coupled(config.bodies, model, len(config.grains)))
     for name, shape in zip(b.names, b.shapes, strict=True):
-        cells = 2 * float(np.min(half_extents(shape))) / grid.cell_size
+        cells = thickness(shape) / grid.cell_size
         if not f.push_out and cells < THINNEST_BY_GRID:
             raise ValueError(
                 f"The geom {name!r} is {cells:.2g} cells thick, and without push_out grains leak through geoms thinner"

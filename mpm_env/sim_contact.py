@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
@@ -12,7 +13,7 @@ from jax import Array, lax
 from coupling import bodies as rigid
 from coupling.bodies import Stance
 from coupling.contact import distances
-from coupling.geoms import Shape, bounding_radius, half_extents
+from coupling.geoms import bounding_radius, thickness
 from coupling.meeting import Geoms, Meeting, Surfaces, counted, found, meet, near
 from mpm_env.health import MOST_DEPTH, MOST_TRAVEL, Health, as_bits
 from mpm_env.mpm.substep import to_nodes
@@ -67,7 +68,9 @@ class Contact(NamedTuple):
         b, dx = scene.bodies, scene.grid.cell_size
         assert b is not None
         g = _geoms(scene)
-        pos, mat = rigid.poses(b, stance, stance.centre, jnp.broadcast_to(jnp.eye(3), (len(b.bodies), 3, 3)))
+        pos, mat = rigid.poses(
+            b, stance, stance.centre, jnp.broadcast_to(jnp.eye(3, dtype=scene.dtype), (len(b.bodies), 3, 3))
+        )
         nodes = scene.world(jnp.asarray(scene.grid.node_positions().T, scene.dtype))
         band = jnp.full(nodes.shape[1:], (scene.fidelity.contact_band + MOST_TRAVEL) * dx, scene.dtype)
         watched, over = near(g, pos, mat, nodes, -NODE_DEPTH * dx, band, scene.sizes.nodes)
@@ -103,8 +106,8 @@ class Contact(NamedTuple):
         touch = self._moved(touch)
         if not self.grains_near.size:
             return touch, p
-        # The native kernel passes over the grains outside by itself.
-        at_once = self.scene.kernels == "native"
+        # The native kernel passes over the grains outside by itself; a GPU would wait for each round.
+        at_once = self.scene.kernels == "native" or jax.default_backend() != "cpu"
         touch, moves = self._stopped(touch, p, self.grains_near) if at_once else self._stopped_in_rounds(touch, p)
         index, dx, dv = moves
         return touch, replace(p, x=p.x.at[:, index].add(dx, mode="drop"), v=p.v.at[:, index].add(dv, mode="drop"))
@@ -112,23 +115,24 @@ class Contact(NamedTuple):
     def _stopped_in_rounds(self, touch: Touch, p: Particles) -> tuple[Touch, Moves]:
         """Stop the grains inside bodies, some at a time.
 
-        Most substeps find few of them: then all but the first rounds, or all, are rest.
+        Most substeps find few of them: then all but the first rounds, or all, are rest. Where more are inside than a
+        round takes, each round meets bodies as the one before left them, and not all at once.
         """
-        near, room = self.grains_near, self.grains_near.size
-        x = self.scene.world(p.x.at[:, near].get(mode="clip"))
+        candidates, room = self.grains_near, self.grains_near.size
+        x = self.scene.world(p.x.at[:, candidates].get(mode="clip"))
         b = self.scene.bodies
         assert b is not None
         phi = distances(b.shapes, x, *rigid.poses(b, self.stance, touch.centre, touch.turn))
-        count = counted((p.m.at[near].get(mode="fill", fill_value=0) > 0) & (phi < 0))
+        count = counted((p.m.at[candidates].get(mode="fill", fill_value=0) > 0) & (phi < 0))
         few = -(-room // ROUNDS)
 
         def stop(touch: Touch, first: Array) -> tuple[Touch, Moves]:
             wanted = found(count, first + jnp.arange(few, dtype=count.dtype))
-            return self._stopped(touch, p, near.at[wanted].get(mode="fill", fill_value=p.count))
+            return self._stopped(touch, p, candidates.at[wanted].get(mode="fill", fill_value=p.count))
 
         def rest(touch: Touch, first: Array) -> tuple[Touch, Moves]:
             none = jnp.zeros((self.scene.dimension, few), x.dtype)
-            return touch, Moves(jnp.full((few,), p.count, near.dtype), none, none)
+            return touch, Moves(jnp.full((few,), p.count, candidates.dtype), none, none)
 
         firsts = few * jnp.arange(ROUNDS, dtype=count.dtype)
         touch, moves = lax.scan(lambda touch, k: lax.cond(k < count[-1], stop, rest, touch, k), touch, firsts)
@@ -164,7 +168,7 @@ class Contact(NamedTuple):
         speed = jnp.linalg.norm(twist[:, :3], axis=-1) + reach * jnp.linalg.norm(twist[:, 3:], axis=-1)
         return as_bits(
             {
-                Health.TOO_DEEP: touch.depth > min(MOST_DEPTH * dx, *(HALFWAY * _half_thickness(s) for s in b.shapes)),
+                Health.TOO_DEEP: touch.depth > min(MOST_DEPTH * dx, *(HALFWAY * thickness(s) / 2 for s in b.shapes)),
                 Health.NODES_OVERFLOW: self.nodes_over,
                 Health.GRAINS_OVERFLOW: self.grains_over,
                 Health.NOT_CONVERGED: touch.residual > MOST_RESIDUAL,
@@ -214,11 +218,6 @@ class Contact(NamedTuple):
         return a if self.scene.dimension == 3 else a[::2]
 
 
-def _half_thickness(shape: Shape) -> float:
-    """Half the smallest side of a geom, m: how deep a grain can be before it is nearer to the other side."""
-    return float(np.min(half_extents(shape)))
-
-
 def _reach(b: rigid.Bodies, body: int) -> float:
     """How far a body's coupled geoms reach from its centre of mass, m; planes count as nothing."""
     centre = b.model.body_ipos[b.bodies[body]]
@@ -251,4 +250,6 @@ def _shares(scene: Scene, p: Particles, watched: Array) -> Array | None:
         return nodes.reshape(-1, nodes.shape[-1]).at[watched, -1].get(mode="fill", fill_value=0)
 
     m = jnp.stack([mass(span) for span in scene.spans])
-    return m / jnp.maximum(jnp.sum(m, axis=0), jnp.finfo(m.dtype).tiny)
+    total = jnp.sum(m, axis=0)
+    # Nodes that have no grains yet may get some within the rigid step: they take the middle of all.
+    return jnp.where(total > 0, m / jnp.where(total > 0, total, 1), 1 / len(scene.spans))

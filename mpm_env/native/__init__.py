@@ -1,8 +1,9 @@
 """C++ kernels for the CPU, called by XLA through `jax.ffi`: whether they are there, and how they are differentiated.
 
 Faster twins of what the continuum (`mpm_env.mpm.kernels`) and contact (`coupling.meeting`) say in JAX, which stays the
-reference: same equations, sums in another order. They use all cores the process may run on (MPM_ENV_THREADS sets
-another number), and a batch under `vmap` is one call. Where they were not built or do not fit, `why_not` says why.
+reference: same equations, sums in another order. Those of the grains use all cores the process may run on
+(MPM_ENV_THREADS sets another number), those of contact a core per environment; a batch under `vmap` is one call. Where
+they were not built or do not fit, `why_not` says why; whoever calls them asks that, or `chosen`, first.
 """
 
 from __future__ import annotations

@@ -7,6 +7,8 @@
 namespace MPM_ISA {
 namespace {
 
+constexpr double LEAST_NORMAL = 1e-6;  // that of meeting.py
+
 // Rows (3, count) from point i on, a pack; beyond the last point, that one again.
 template <class S> INLINE void load(const S* a, int64_t count, int64_t i, Rows<S>& x) {
   for (int r = 0; r < 3; ++r) {
@@ -58,7 +60,7 @@ template <class S> void run(const Meet& t, int64_t b) {
   const S *v = (const S*)t.v + b * 3 * K, *m = (const S*)t.m + b * K;
   const S *centre = (const S*)t.centre + b * 3 * B, *J = (const S*)t.J + b * 6 * B * nv, *d = (const S*)t.d + b * 6 * B;
   const S *M = (const S*)t.M + b * nv * nv, *mu = (const S*)t.mu + b * G * t.materials, *q_free = (const S*)t.q_free + b * nv;
-  const S *most = (const S*)t.hold + b * t.materials, *shares = (const S*)t.shares + b * t.materials * K;
+  const S *hold_most = (const S*)t.hold + b * t.materials, *shares = (const S*)t.shares + b * t.materials * K;
   S *phi = (S*)t.phi + b * K, *n = (S*)t.n + b * 3 * K, *impulse = (S*)t.impulse + b * 3 * K;
   const auto geoms = placed<S>(t.geoms, (const S*)t.pos + b * 3 * G, (const S*)t.mat + b * 9 * G);
   std::fill_n(phi, K, S(t.reach));
@@ -82,7 +84,7 @@ template <class S> void run(const Meet& t, int64_t b) {
         normals<S>(geoms, at, f, normal);
         if (t.plane_strain) {
           normal[1] = Pack<S>(S(0));
-          Pack<S> size = largest(root(dot<S>(normal, normal)), S(1e-6));
+          Pack<S> size = largest(root(dot<S>(normal, normal)), S(LEAST_NORMAL));
           for (int r = 0; r < 3; ++r) normal[r] = normal[r] / size;
         }
         alignas(64) S way[4][W];
@@ -126,7 +128,7 @@ template <class S> void run(const Meet& t, int64_t b) {
     for (int64_t k = 0; k < t.materials; ++k) {
       const S share = t.materials == 1 ? S(1) : shares[k * K + i];
       friction += share * mu[g * t.materials + k];
-      hold += share * weight * most[k];
+      hold += share * weight * hold_most[k];
     }
     mine[FRICTION * W] = friction;
     mine[HOLD * W] = hold;

@@ -10,7 +10,7 @@
 
 namespace MPM_ISA {
 
-constexpr double TINY = 1e-20, SOLVED = 4, NOISE = 1e-6;  // as in exchange.py and contact.py
+constexpr double TINY = 1e-20, SOLVED = 4, NOISE = 1e-6;  // those of exchange.py and contact.py, as a test sees to
 constexpr int STEPS = 4;
 constexpr double STEP[STEPS] = {1, 0.5, 0.25, 0.0625};
 
@@ -61,7 +61,7 @@ template <class S> struct Crowd {
 // The inelastic contact with Coulomb friction and adhesion: impulses f on points that move with w relative to their bodies.
 template <class S> INLINE void impulses(const Pack<S>* p, const Rows<S>& w, Rows<S>& f) {
   const Pack<S>*n = p + NORMAL, m = p[MASS], hold = p[HOLD];
-  Pack<S> approach = -(w[0] * n[0] + w[1] * n[1] + w[2] * n[2]), normal = both(m * approach, -hold);
+  Pack<S> approach = -(w[0] * n[0] + w[1] * n[1] + w[2] * n[2]), normal = largest(m * approach, -hold);
   Rows<S> slide;
   for (int i = 0; i < 3; ++i) slide[i] = w[i] + approach * n[i];
   Pack<S> held = p[FRICTION] * (normal + hold) / root(dot<S>(slide, slide) + S(TINY));
@@ -74,7 +74,7 @@ template <class S> INLINE void impulses(const Pack<S>* p, const Rows<S>& w, Rows
 template <class S> INLINE void stiffness(const Pack<S>* p, const Rows<S>& w, Pack<S> D[3][3]) {
   const Pack<S> zero(S(0)), one(S(1));
   const Pack<S>*n = p + NORMAL, hold = p[HOLD];
-  Pack<S> approach = -(w[0] * n[0] + w[1] * n[1] + w[2] * n[2]), normal = both(p[MASS] * approach, -hold);
+  Pack<S> approach = -(w[0] * n[0] + w[1] * n[1] + w[2] * n[2]), normal = largest(p[MASS] * approach, -hold);
   Rows<S> t;
   for (int i = 0; i < 3; ++i) t[i] = w[i] + approach * n[i];
   Pack<S> speed = root(dot<S>(t, t) + S(TINY)), rub = p[FRICTION] * (normal + hold) / speed;

@@ -50,9 +50,17 @@ int64_t batch_of(const ffi::AnyBuffer& a, size_t rank) {
   return n;
 }
 
+// Buffers are read as the type of the first: any other would be misread.
+template <class... Buffers> bool alike(const ffi::AnyBuffer& first, const Buffers&... rest) {
+  const auto type = first.element_type();
+  return (type == ffi::F32 || type == ffi::F64) && ((rest.element_type() == type) && ...);
+}
+const auto MIXED = [] { return ffi::Error::InvalidArgument("mpm-env: arrays of different precision in one native call."); };
+
 ffi::Error to_nodes(ffi::AnyBuffer x, ffi::AnyBuffer v, ffi::AnyBuffer C, ffi::AnyBuffer tau, ffi::AnyBuffer m,
                     ffi::AnyBuffer V0, ffi::AnyBuffer step, ffi::AnyBuffer watched, ffi::Result<ffi::AnyBuffer> nodes,
                     Ints shape, Ints kinds, Floats friction, double cell_size, int64_t margin, double least_mass) {
+  if (!alike(x, v, C, tau, m, V0, step) || watched.element_type() != ffi::S32) return MIXED();
   ToNodes t{};
   t.grid = grid_of(shape, kinds, friction, cell_size, margin);
   t.batch = batch_of(x, 2);
@@ -73,6 +81,7 @@ ffi::Error to_grains(ffi::AnyBuffer nodes, ffi::AnyBuffer m, ffi::AnyBuffer para
                      ffi::Result<ffi::AnyBuffer> v, ffi::Result<ffi::AnyBuffer> C, ffi::Result<ffi::AnyBuffer> e,
                      ffi::Result<ffi::AnyBuffer> tau, ffi::Result<ffi::AnyBuffer> history, Ints shape, Ints kinds,
                      Floats friction, double cell_size, int64_t margin, int64_t law, int64_t start, int64_t stop) {
+  if (!alike(nodes, m, parameter, *x, *v, *C, *e, *tau, *history)) return MIXED();
   ToGrains t{};
   t.grid = grid_of(shape, kinds, friction, cell_size, margin);
   t.batch = batch_of(*x, 2);
@@ -98,6 +107,7 @@ GeomTable geoms_of(Ints kind, Ints first, Ints nodes, Floats size, Floats reach,
 ffi::Error near(ffi::AnyBuffer x, ffi::AnyBuffer high, ffi::AnyBuffer pos, ffi::AnyBuffer mat, ffi::AnyBuffer voxels,
                 ffi::Result<ffi::AnyBuffer> index, ffi::Result<ffi::AnyBuffer> found, Ints kind, Ints first, Ints nodes,
                 Floats size, Floats reach, Floats origin, Floats spacing, double low) {
+  if (!alike(x, high, pos, mat) || voxels.element_type() != ffi::F32) return MIXED();
   Near t{};
   t.geoms = geoms_of(kind, first, nodes, size, reach, origin, spacing, voxels);
   t.batch = batch_of(x, 2);
@@ -119,6 +129,8 @@ ffi::Error meet(ffi::AnyBuffer x, ffi::AnyBuffer v, ffi::AnyBuffer m, ffi::AnyBu
                 ffi::Result<ffi::AnyBuffer> scale, Ints kind, Ints first, Ints nodes, Floats size, Floats reach,
                 Floats origin, Floats spacing, Ints body_of, int64_t iterations, bool plane_strain, double within,
                 double layer) {
+  if (!alike(x, v, m, pos, mat, centre, J, d, M, mu, hold, shares, q_free) || voxels.element_type() != ffi::F32)
+    return MIXED();
   Meet t{};
   t.geoms = geoms_of(kind, first, nodes, size, reach, origin, spacing, voxels);
   t.body_of = body_of.begin();

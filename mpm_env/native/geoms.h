@@ -10,13 +10,13 @@
 
 namespace MPM_ISA {
 
-constexpr double TINY_SQUARE = 1e-30, NUDGE = 1e-9, FLAT_GRADIENT = 1e-6;  // as in geoms.py
+constexpr double TINY_SQUARE = 1e-30, NUDGE = 1e-9, FLAT_GRADIENT = 1e-6;  // those of geoms.py, as a test sees to
 constexpr int HALVINGS = 10, NEWTON_STEPS = 4;
 
 template <class S> using Rows = Pack<S>[3];
 
 template <class S> INLINE Pack<S> dot(const Rows<S>& a, const Rows<S>& b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
-template <class S> INLINE Pack<S> both(Pack<S> a, Pack<S> b) { return select<S>(b > a, b, a); }  // the larger
+template <class S> INLINE Pack<S> largest(Pack<S> a, Pack<S> b) { return select<S>(b > a, b, a); }
 template <class S> INLINE Pack<S> sign(Pack<S> a) { return select<S>(a < S(0), Pack<S>(S(-1)), Pack<S>(S(1))); }
 
 // A geom where it is now.
@@ -56,8 +56,8 @@ template <class S> std::vector<Geom<S>> placed(const GeomTable& t, const S* pos,
 // The region where q[0], .. q[N - 1] <= 0, seen from one corner: distance, and with `slope` its derivative by q.
 template <class S, int N> INLINE Pack<S> corner(const Pack<S>* q, Pack<S>* slope) {
   Pack<S> nearest = q[0], square(S(0)), out[N];
-  for (int i = 1; i < N; ++i) nearest = both(nearest, q[i]);
-  for (int i = 0; i < N; ++i) { out[i] = both(q[i], Pack<S>(S(0))); square = square + out[i] * out[i]; }
+  for (int i = 1; i < N; ++i) nearest = largest(nearest, q[i]);
+  for (int i = 0; i < N; ++i) { out[i] = largest(q[i], Pack<S>(S(0))); square = square + out[i] * out[i]; }
   Pack<S> far = root(square);
   Bits<S> outside = square > S(TINY_SQUARE);
   if (slope) {
@@ -85,7 +85,7 @@ template <class S> INLINE Pack<S> ellipsoid(const Geom<S>& g, const Rows<S>& p, 
   Rows<S> rp;
   S gap[3];
   for (int i = 0; i < 3; ++i) { rp[i] = r[i] * largest(magnitude(p[i]), S(NUDGE) * least); gap[i] = (r[i] - least) * (r[i] + least); }
-  Pack<S> low = both(both(rp[0] - gap[0], rp[1] - gap[1]), rp[2] - gap[2]), high = root(dot<S>(rp, rp));
+  Pack<S> low = largest(largest(rp[0] - gap[0], rp[1] - gap[1]), rp[2] - gap[2]), high = root(dot<S>(rp, rp));
   for (int k = 0; k < HALVINGS; ++k) {
     Pack<S> middle = root(low * high), sum(S(0));
     for (int i = 0; i < 3; ++i) { Pack<S> u = rp[i] / (middle + gap[i]); sum = sum + u * u; }
@@ -188,7 +188,7 @@ template <class S> INLINE Facing<S> nearest(const std::vector<const Geom<S>*>& g
   Facing<S> f{limit, Bits<S>(I(-1))};
   for (const Geom<S>* g : geoms) {
     Rows<S> p = {x[0] - g->at[0], x[1] - g->at[1], x[2] - g->at[2]};
-    const Pack<S> close = both(f.phi + g->reach, Pack<S>(S(0)));
+    const Pack<S> close = largest(f.phi + g->reach, Pack<S>(S(0)));
     if (!any(dot<S>(p, p) < close * close)) continue;
     g->inward(x, p);
     Pack<S> phi = distance<S>(*g, p, nullptr);
@@ -210,7 +210,7 @@ INLINE void worth_a_look(const std::vector<Geom<S>>& geoms, const Rows<S>* x, in
   S low[3], high[3];
   for (int r = 0; r < 3; ++r) {
     Pack<S> least(std::numeric_limits<S>::infinity()), most = -least;
-    for (int k = 0; k < packs; ++k) { least = select<S>(x[k][r] < least, x[k][r], least); most = both(most, x[k][r]); }
+    for (int k = 0; k < packs; ++k) { least = select<S>(x[k][r] < least, x[k][r], least); most = largest(most, x[k][r]); }
     alignas(64) S a[W], b[W];
     least.store(a); most.store(b);
     low[r] = a[0]; high[r] = b[0];

@@ -56,6 +56,7 @@ struct Pool {
 
   void run(int tasks, const std::function<void(int)>& what) {
     const uint32_t mine = round + 1;
+    next = uint64_t(mine) << 32 | INT32_MAX;  // first, so that whoever still looks at the old round finds it over
     done = 0;
     count = tasks;
     task = &what;

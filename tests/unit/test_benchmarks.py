@@ -6,9 +6,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
+import numpy as np
 import pytest
 
-from benchmarks import box, report
+from benchmarks import box, report, stages
 from benchmarks.clock import in_turns, spread
 from benchmarks.throughput import HEAPS, fit, same_job
 
@@ -50,6 +53,33 @@ def test_rivals_take_turns_after_one_unmeasured_round() -> None:
     times = in_turns({name: lambda name=name: seen.append(name) for name in "ab"}, rounds=2)
     assert "".join(seen) == "ababab"
     assert {name: len(values) for name, values in times.items()} == {"a": 2, "b": 2}
+
+
+def test_stage_on_the_same_values_is_run_each_time() -> None:
+    calls: list[float] = []
+
+    def on_host(x: jax.Array) -> np.ndarray:
+        calls.append(float(x))
+        return np.float32(2 * x)
+
+    run = stages.anew(lambda x: jax.pure_callback(on_host, jax.ShapeDtypeStruct((), jnp.float32), x), jnp.float32(3))
+    assert run(7)[1] == 6
+    assert calls == [3] * 7
+    run(0)
+    assert len(calls) == 7
+
+
+def test_cost_of_a_call_is_no_part_of_a_stage(monkeypatch: pytest.MonkeyPatch) -> None:
+    call, once = 3e-3, 2e-5
+    monkeypatch.setattr(stages, "in_turns", lambda jobs, _: {key: [call + key[1] * once] for key in jobs})
+    assert stages.seconds({"stage": lambda times: None}, 1)["stage"] == pytest.approx(once)
+
+
+def test_goal_for_bodies_is_that_of_standard_fidelity(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(report.results, "FOLDER", tmp_path)
+    steps = {"draft": {"share on top of grains": 0.875}, "standard": {"share on top of grains": 0.125}}
+    (tmp_path / "stages.json").write_text(json.dumps({"kernels": {"native": {"dig, rigid step": steps}}}))
+    assert "| native: bodies in the dig scene, on top of grains | <= 0.3 | 0.125 |" in report.goals()
 
 
 def test_report_needs_no_results(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -1,12 +1,14 @@
 """The native kernels against the same equations in JAX: laws, dimensions, precisions, extremes, batches, threads."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +16,7 @@ import numpy as np
 import pytest
 from jax import Array, lax
 
+from coupling import contact, exchange, geoms, meeting
 from mpm_env import native
 from mpm_env.mpm.kernels import LAWS
 from mpm_env.mpm.materials import Elastic, Sand, Snow
@@ -249,6 +252,7 @@ DIGEST = """
 import hashlib, sys, jax, numpy as np
 sys.path.insert(0, {root!r})
 from tests.unit.test_native import grains, material, walk
+from coupling import contact, exchange, geoms, meeting
 from mpm_env import native
 p = grains(3, "float32")
 after = walk(p, (material("sand", "float32"),), d=3, beds=((0, p.count),), kernels="native")
@@ -326,6 +330,27 @@ def test_without_a_library_there_is_a_word_and_plain_xla(monkeypatch: pytest.Mon
     finally:
         monkeypatch.undo()
         native.why_not.cache_clear()
+
+
+HEADERS = Path(native.__file__).parent
+
+
+@pytest.mark.parametrize(
+    ("file", "module", "names"),
+    [
+        ("geoms.h", geoms, ("TINY_SQUARE", "NUDGE", "FLAT_GRADIENT", "HALVINGS", "NEWTON_STEPS")),
+        ("exchange.h", exchange, ("SOLVED", "NOISE")),
+        ("exchange.h", contact, ("TINY",)),
+        ("contact.cpp", meeting, ("LEAST_NORMAL",)),
+    ],
+)
+def test_constants_of_the_kernels_are_those_of_the_reference(file: str, module: Any, names: tuple[str, ...]) -> None:
+    text = (HEADERS / file).read_text()
+    for name in names:
+        found = re.search(rf"\b{name} = ([-+.\de]+)", text)
+        assert found and float(found[1]) == getattr(module, name), name
+    steps = re.search(r"STEP\[STEPS\] = \{([^}]*)\}", (HEADERS / "exchange.h").read_text())
+    assert steps and tuple(map(float, steps[1].split(","))) == exchange.STEPS
 
 
 def test_least_b_is_one_number() -> None:
