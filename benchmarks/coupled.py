@@ -58,9 +58,9 @@ def box_drop(kernels: str) -> Scene:
     return build(SceneConfig(**data), Fidelity(cells=2, kernels=kernels))
 
 
-def digging(kernels: str, quick: bool) -> Scene:
+def digging(kernels: str, fidelity: str) -> Scene:
     """The shipped digging scene."""
-    return build(read_scene("bucket_dig"), load_fidelity("draft" if quick else "standard", [f"kernels={kernels}"]))
+    return build(read_scene("bucket_dig"), load_fidelity(fidelity, [f"kernels={kernels}"]))
 
 
 class Run:
@@ -106,7 +106,7 @@ def dropped(run: Run) -> dict[str, Any]:
 
 def measured(kernels: str, quick: bool) -> dict[str, Any]:
     """Both jobs with these kernels."""
-    run = Run(digging(kernels, quick), DIG_STEPS)
+    run = Run(digging(kernels, "draft" if quick else "standard"), DIG_STEPS)
     out = {"dig": run.timed(ROUNDS)}
     drop = Run(box_drop(kernels), DROP_STEPS)
     calls = ROUNDS if quick else round(box.DURATION / drop.per_call)
