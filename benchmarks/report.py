@@ -78,7 +78,7 @@ def compare(r: dict[str, Any]) -> str:
 
 def stages(r: dict[str, Any]) -> str:
     """Stage by stage, and the roofline."""
-    text = ""
+    text = "The least of the rounds: small stages are differences, in which medians of a busy machine say little.\n\n"
     for kernels, scenes in r["kernels"].items():
         names = list(dict.fromkeys(name for key in ("column", "dig") for name in scenes[key] if name != "grains"))
         head = [
