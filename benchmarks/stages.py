@@ -6,8 +6,7 @@ CPU time on one core, the least of some rounds, in which the stages take turns: 
 it, and small differences of medians would drown in that. A stage runs many times inside one compiled program, as it
 does in a step, and a call in which it does not run at all is taken off: calls cost more than most stages. Those of the
 continuum are in ns per grain and substep. Those of the dig's rigid step, in us, run after a substep of the grains that
-is taken off too: it leaves cold caches, in which MJX takes about three times as long as alone. "rest" is the whole less
-them.
+is taken off too: it leaves cold caches, in which MJX takes about three times as long as alone. "rest" is what is left.
 """
 
 from __future__ import annotations
