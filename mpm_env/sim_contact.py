@@ -68,9 +68,7 @@ class Contact(NamedTuple):
         b, dx = scene.bodies, scene.grid.cell_size
         assert b is not None
         g = _geoms(scene)
-        pos, mat = rigid.poses(
-            b, stance, stance.centre, jnp.broadcast_to(jnp.eye(3, dtype=scene.dtype), (len(b.bodies), 3, 3))
-        )
+        pos, mat = rigid.poses(b, stance, stance.centre, _not_turned(stance))
         nodes = scene.world(jnp.asarray(scene.grid.node_positions().T, scene.dtype))
         band = jnp.full(nodes.shape[1:], (scene.fidelity.contact_band + MOST_TRAVEL) * dx, scene.dtype)
         watched, over = near(g, pos, mat, nodes, -NODE_DEPTH * dx, band, scene.sizes.nodes)
@@ -85,11 +83,10 @@ class Contact(NamedTuple):
 
     def start(self, q: Array) -> Touch:
         """Nothing has happened yet; joints move with q (nv,)."""
-        B, G = self.stance.centre.shape[0], self.stance.lever.shape[0]
-        dtype = self.stance.centre.dtype
-        zero = jnp.zeros((), dtype)
-        eye = jnp.broadcast_to(jnp.eye(3, dtype=dtype), (B, 3, 3))
-        return Touch(q, self.stance.centre, eye, jnp.zeros_like(q), jnp.zeros((G, 6), dtype), zero, zero)
+        s = self.stance
+        zero = jnp.zeros((), s.centre.dtype)
+        wrench = jnp.zeros((s.lever.shape[0], 6), s.centre.dtype)
+        return Touch(q, s.centre, _not_turned(s), jnp.zeros_like(q), wrench, zero, zero)
 
     def nodes(self, touch: Touch, v: Array, m: Array) -> tuple[Touch, Array]:
         """Exchange momentum between bodies and the grid nodes within the band."""
@@ -216,6 +213,11 @@ class Contact(NamedTuple):
     def _flatten(self, a: Array) -> Array:
         """Rows (3, K) of space as rows (d, K) of the grid."""
         return a if self.scene.dimension == 3 else a[::2]
+
+
+def _not_turned(stance: Stance) -> Array:
+    """The bodies' turns (B, 3, 3) since the start of the rigid step, at its start."""
+    return jnp.broadcast_to(jnp.eye(3, dtype=stance.centre.dtype), (stance.centre.shape[0], 3, 3))
 
 
 def _reach(b: rigid.Bodies, body: int) -> float:
