@@ -30,8 +30,8 @@ bench: $(READY)  ## all benchmarks, into docs/performance.md (ARGS=--quick; PEER
 test: $(READY)  ## all tests, a process per core
 	$(BIN)/python -m pytest -n auto --dist loadfile $(ARGS)
 
-test-xla: $(READY)  ## the physics once more on plain XLA, without the native kernels
-	MPM_ENV_KERNELS=xla $(BIN)/python -m pytest tests/physics -m "not slow" -n auto --dist loadfile $(ARGS)
+test-xla: $(READY)  ## physics and coupling once more on plain XLA, without the native kernels
+	MPM_ENV_KERNELS=xla $(BIN)/python -m pytest tests/physics tests/coupling -m "not slow" -n auto --dist loadfile $(ARGS)
 
 test-fast: $(READY)  ## the tests under 5 s each
 	$(BIN)/python -m pytest -m "not slow" $(ARGS)

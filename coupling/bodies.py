@@ -27,6 +27,7 @@ from coupling.contact import distances
 from coupling.exchange import Twists
 from coupling.geoms import Shape, bounding_radius, centre, half_extents, once, shape_of
 
+AT_ONCE = 8192  # points whose distances are computed on the host in one call
 INTEGRATORS = {mujoco.mjtIntegrator.mjINT_EULER: "Euler", mujoco.mjtIntegrator.mjINT_IMPLICITFAST: "implicitfast"}
 
 
@@ -112,16 +113,20 @@ def _jointed(model: mujoco.MjModel, body: int) -> bool:
     return bool(model.body_treeid[body] >= 0)
 
 
-def start(b: Bodies, qpos: np.ndarray, qvel: np.ndarray, ctrl: np.ndarray, mocap: tuple[np.ndarray, np.ndarray]) -> Any:
-    """MJX data at qpos (nq,) with joint velocities qvel (nv,), controls ctrl (nu,) and mocap poses set; fresh.
-
-    C MuJoCo places the bodies: a program in which they start has nothing of it to compile.
-    """
+def posed(
+    b: Bodies, qpos: np.ndarray, qvel: np.ndarray, ctrl: np.ndarray, mocap: tuple[np.ndarray, np.ndarray]
+) -> mujoco.MjData:
+    """MuJoCo's data at qpos (nq,) with joint velocities qvel (nv,), controls ctrl (nu,) and mocap poses set; fresh."""
     d = mujoco.MjData(b.model)
     d.qpos[:], d.qvel[:], d.ctrl[:] = qpos, qvel, ctrl
     d.mocap_pos[:], d.mocap_quat[:] = mocap
     for stage in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_comVel):
         stage(b.model, d)
+    return d
+
+
+def start(b: Bodies, d: mujoco.MjData) -> Any:
+    """MJX data from MuJoCo's, see `posed`: a program in which bodies start has nothing of placing them to compile."""
     return mjx.put_data(b.model, d)
 
 
@@ -349,19 +354,34 @@ def points_near(
         mine = [i for i, owner in enumerate(b.body_of) if owner == body and np.isfinite(bounding_radius(b.shapes[i]))]
         if not mine:
             continue
-        shapes = tuple(b.shapes[i] for i in mine)
-        pos = np.asarray([d.geom_xpos[b.geoms[i]] for i in mine])
-        mat = np.asarray([d.geom_xmat[b.geoms[i]].reshape(3, 3) for i in mine])
-        reach = np.asarray([np.abs(m) @ half_extents(s) for m, s in zip(mat, shapes, strict=True)]) + high
-        at = pos + np.asarray([m @ centre(s) for m, s in zip(mat, shapes, strict=True)])
-        axes = [np.arange(lo, hi + step, step) for lo, hi in zip((at - reach).min(0), (at + reach).max(0), strict=True)]
+        lows, highs = np.asarray([_box_around(b, d, i) for i in mine]).swapaxes(0, 1)
+        axes = [np.arange(lo, hi + step, step) for lo, hi in zip(lows.min(0) - high, highs.max(0) + high, strict=True)]
         if middle is not None:
             axes[1] = np.asarray([middle])
-        x = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-        phi = np.asarray(_distances(shapes, jnp.asarray(x.T, jnp.float32), jnp.asarray(pos), jnp.asarray(mat)))
+        phi = distances_from(b, d, mine, np.stack(np.meshgrid(*axes, indexing="ij")).reshape(3, -1))
         per_point = 8 if middle is None else 4
         total += [-(-np.count_nonzero((phi > low) & (phi < top)) // per_point) for low, top in bands]
     return tuple(int(n) for n in total)
+
+
+def _box_around(b: Bodies, d: mujoco.MjData, i: int) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper corner (3,) m of the box along the world's axes around the coupled geom i."""
+    mat = d.geom_xmat[b.geoms[i]].reshape(3, 3)
+    middle, half = d.geom_xpos[b.geoms[i]] + mat @ centre(b.shapes[i]), np.abs(mat) @ half_extents(b.shapes[i])
+    return middle - half, middle + half
+
+
+def distances_from(b: Bodies, d: mujoco.MjData, some: list[int], x: np.ndarray) -> np.ndarray:
+    """Distance (n,) m of points x (3, n) m to the nearest of some coupled geoms, on the host."""
+    ids = np.asarray(b.geoms)[some]
+    shapes, pos, mat = tuple(b.shapes[i] for i in some), d.geom_xpos[ids], d.geom_xmat[ids].reshape(-1, 3, 3)
+    pos, mat = pos.astype(np.float32), mat.astype(np.float32)
+    out = []
+    for k in range(0, x.shape[1], AT_ONCE):  # of one size, so that one program serves all
+        few = x[:, k : k + AT_ONCE].astype(np.float32)
+        padded = np.pad(few, ((0, 0), (0, AT_ONCE - few.shape[1])))
+        out.append(np.asarray(_distances(shapes, padded, pos, mat))[: few.shape[1]])
+    return np.concatenate(out)
 
 
 @partial(jax.jit, static_argnums=0)

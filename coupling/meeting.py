@@ -50,7 +50,7 @@ def near(g: Geoms, pos: Array, mat: Array, x: Array, low: float, high: Array, ro
         index, found = jax.ffi.ffi_call(
             "mpm_env_near",
             (jax.ShapeDtypeStruct((room,), jnp.int32), jax.ShapeDtypeStruct((1,), jnp.int32)),
-            vmap_method="broadcast_all",
+            vmap_method="expand_dims",
         )(*jax.lax.stop_gradient((x, high, pos, mat)), _voxels(g), **_table(g), low=np.float64(low))
         return index, found[0] > room
     phi = distances(g.shapes, x, pos, mat)
@@ -93,7 +93,7 @@ def meet(
     def kernel(pos: Array, mat: Array, t: Twists, s: Surfaces, q_free: Array, x: Array, v: Array, m: Array) -> Meeting:
         shapes = (m.shape, x.shape, q_free.shape, x.shape, (len(g.shapes), 6), (1,), (1,))
         call = jax.ffi.ffi_call(
-            "mpm_env_meet", [jax.ShapeDtypeStruct(s, x.dtype) for s in shapes], vmap_method="broadcast_all"
+            "mpm_env_meet", [jax.ShapeDtypeStruct(s, x.dtype) for s in shapes], vmap_method="expand_dims"
         )
         attributes = {
             "body_of": np.asarray(g.body_of, np.int64),

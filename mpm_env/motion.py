@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation, Slerp
 
 from mpm_env.config import nearest
@@ -114,6 +113,8 @@ def _curve(path: list, name: str) -> Curve:
     values = np.asarray([v for _, v in path], float)
     if len(times) == 1:
         return lambda t: values[0]
+    from scipy.interpolate import PchipInterpolator  # a fifth of a second, which scenes without a script do not wait
+
     spline = PchipInterpolator(times, values)
     return lambda t: spline(np.clip(t, times[0], times[-1]))
 

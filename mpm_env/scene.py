@@ -9,11 +9,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from jax import Array
 
-from coupling.bodies import Bodies, refresh, start
-from coupling.contact import nearest_geom
+from coupling.bodies import Bodies, distances_from, posed, refresh, start
 from mpm_env import native
 from mpm_env.config import nearest
 from mpm_env.fidelity import Fidelity
@@ -120,11 +120,12 @@ class State:
         return jax.tree.map(lambda a: a[..., home], grains)
 
 
-def lift(a: Array, y: float = 0.0) -> Array:
+def lift(a: Any, y: float = 0.0) -> Any:
     """Rows (2, n) of plane strain as rows (3, n) of space, the middle one y; rows (3, n) as they are."""
     if a.shape[0] == 3:
         return a
-    return jnp.stack([a[0], jnp.full_like(a[0], y), a[1]])
+    stack = np if isinstance(a, np.ndarray) else jnp
+    return stack.stack([a[0], stack.full_like(a[0], y), a[1]])
 
 
 def build(config: SceneConfig, fidelity: Fidelity) -> Scene:
@@ -216,7 +217,7 @@ def initial(scene: Scene, key: Array, *, qpos: Array | None = None) -> State:
     )
     rigid = None
     if scene.bodies is not None:
-        rigid = start(scene.bodies, *_keyframe(scene), scene.motion.control(0.0), scene.motion.mocap(0.0))
+        rigid = start(scene.bodies, _first_pose(scene))
         if qpos is not None:
             rigid = refresh(scene.bodies, rigid.replace(qpos=jnp.asarray(qpos, rigid.qpos.dtype)))
     geoms = len(scene.bodies.geoms) if scene.bodies else 0
@@ -321,26 +322,30 @@ def _substeps(config: SceneConfig, f: Fidelity, grid: Grid, materials: tuple[Mat
     return math.ceil(f.rigid_dt / longest - WHOLE)
 
 
+def _first_pose(scene: Scene) -> mujoco.MjData:
+    """Where the bodies are at the start."""
+    assert scene.bodies is not None
+    return posed(scene.bodies, *_keyframe(scene), scene.motion.control(0.0), scene.motion.mocap(0.0))
+
+
 def _refuse_overlap(scene: Scene) -> None:
-    """Refuse grains that start inside a body: MPM would squeeze them out with a bang."""
-    if scene.bodies is None or not scene.slots:
+    """Refuse grains that start inside a body, an uneven top at its mean: MPM would squeeze them out with a bang."""
+    b, fills = scene.bodies, [fill for some in scene.fills for fill in some]
+    if b is None or not fills:
         return
-    shapes, geoms = scene.bodies.shapes, np.asarray(scene.bodies.geoms)
-
-    def look(key: Array) -> tuple[Array, Array]:
-        state = initial(scene, key)
-        d = state.rigid
-        phi, _, geom = nearest_geom(shapes, scene.world(state.grains.x), d.geom_xpos[geoms], d.geom_xmat[geoms])
-        return jnp.where(state.grains.m > 0, phi, jnp.inf), geom
-
-    phi, geom = map(np.asarray, jax.jit(look)(jax.random.key(0)))
-    worst = int(np.argmin(phi))
-    if phi[worst] < -OVERLAP * scene.grid.cell_size:
-        inside = int(np.count_nonzero(phi < -OVERLAP * scene.grid.cell_size))
-        raise ValueError(
-            f"{inside} grains start inside the geom {scene.bodies.names[int(geom[worst])]!r},"
-            f" up to {-phi[worst]:.3g} m deep: move the body or the material apart."
-        )
+    sites = [f.sites if f.top is None else f.sites[f.sites[:, -1] < f.top] for f in fills]
+    x, d = lift(np.concatenate(sites).T, scene.middle), _first_pose(scene)
+    for body in range(len(b.bodies)):
+        mine = [i for i, owner in enumerate(b.body_of) if owner == body]
+        phi = distances_from(b, d, mine, x)
+        inside = phi < -OVERLAP * scene.grid.cell_size
+        if inside.any():
+            worst = int(np.argmin(phi))
+            name = min((float(distances_from(b, d, [i], x[:, worst : worst + 1])[0]), b.names[i]) for i in mine)[1]
+            raise ValueError(
+                f"{inside.sum()} grains start inside the geom {name!r}, up to {-phi[worst]:.3g} m deep: move the body"
+                " or the material apart."
+            )
 
 
 def inside_grid(grid: Grid, x: Array) -> Array:

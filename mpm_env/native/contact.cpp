@@ -37,9 +37,9 @@ template <class S, class L, class F> INLINE void walk(const std::vector<Geom<S>>
 }
 
 template <class S> void run(const Near& t, int64_t b) {
-  const int64_t N = t.points, G = t.geoms.count;
-  const S *x = (const S*)t.x + b * 3 * N, *high = (const S*)t.high + b * N, low = S(t.low);
-  const auto geoms = placed<S>(t.geoms, (const S*)t.pos + b * 3 * G, (const S*)t.mat + b * 9 * G);
+  const int64_t N = t.points;
+  const S *x = t.x.of<S>(b), *high = t.high.of<S>(b), low = S(t.low);
+  const auto geoms = placed<S>(t.geoms, b, t.pos.of<S>(b), t.mat.of<S>(b));
   int32_t *index = t.index + b * t.room, found = 0;
   walk<S>(
       geoms, x, N, [&](int64_t i, int64_t end) { return *std::max_element(high + i, high + end); },
@@ -56,13 +56,12 @@ template <class S> void run(const Near& t, int64_t b) {
 
 template <class S> void run(const Meet& t, int64_t b) {
   typedef typename IntOf<S>::type I;
-  const int64_t K = t.points, G = t.geoms.count, B = t.bodies, nv = t.nv;
-  const S *v = (const S*)t.v + b * 3 * K, *m = (const S*)t.m + b * K;
-  const S *centre = (const S*)t.centre + b * 3 * B, *J = (const S*)t.J + b * 6 * B * nv, *d = (const S*)t.d + b * 6 * B;
-  const S *M = (const S*)t.M + b * nv * nv, *mu = (const S*)t.mu + b * G * t.materials, *q_free = (const S*)t.q_free + b * nv;
-  const S *hold_most = (const S*)t.hold + b * t.materials, *shares = (const S*)t.shares + b * t.materials * K;
+  const int64_t K = t.points, G = t.geoms.count, nv = t.nv;
+  const S *at_x = t.x.of<S>(b), *v = t.v.of<S>(b), *m = t.m.of<S>(b);
+  const S *centre = t.centre.of<S>(b), *J = t.J.of<S>(b), *d = t.d.of<S>(b), *M = t.M.of<S>(b);
+  const S *mu = t.mu.of<S>(b), *hold_most = t.hold.of<S>(b), *shares = t.shares.of<S>(b), *q_free = t.q_free.of<S>(b);
   S *phi = (S*)t.phi + b * K, *n = (S*)t.n + b * 3 * K, *impulse = (S*)t.impulse + b * 3 * K;
-  const auto geoms = placed<S>(t.geoms, (const S*)t.pos + b * 3 * G, (const S*)t.mat + b * 9 * G);
+  const auto geoms = placed<S>(t.geoms, b, t.pos.of<S>(b), t.mat.of<S>(b));
   std::fill_n(phi, K, S(t.reach));
   std::fill_n(n, 3 * K, S(0));
   std::fill_n(impulse, 3 * K, S(0));
@@ -73,7 +72,7 @@ template <class S> void run(const Meet& t, int64_t b) {
   for (int64_t i = 0; i < K; ++i) if (m[i] > 0) heavy.push_back(int32_t(i));
   const int64_t some = int64_t(heavy.size());
   std::vector<S> x(3 * some);
-  for (int r = 0; r < 3; ++r) for (int64_t a = 0; a < some; ++a) x[r * some + a] = ((const S*)t.x)[(b * 3 + r) * K + heavy[a]];
+  for (int r = 0; r < 3; ++r) for (int64_t a = 0; a < some; ++a) x[r * some + a] = at_x[r * K + heavy[a]];
   const Pack<S> limit = Pack<S>(S(t.reach));
   walk<S>(
       geoms, x.data(), some, [&](int64_t, int64_t) { return S(t.reach); },

@@ -50,6 +50,14 @@ int64_t batch_of(const ffi::AnyBuffer& a, size_t rank) {
   return n;
 }
 
+// An operand of own rank `rank`, of one environment each or for all; the environments are those of the result `all`.
+Shared shared(const ffi::AnyBuffer& a, size_t rank, ffi::AnyBuffer::Dimensions all) {
+  const auto own = a.dimensions();
+  int64_t per = 1;
+  for (size_t i = own.size() - rank; i < own.size(); ++i) per *= own[i];
+  return {a.untyped_data(), per, int64_t(own.size() - rank), own.begin(), all.begin()};
+}
+
 // Buffers are read as the type of the first: any other would be misread.
 template <class... Buffers> bool alike(const ffi::AnyBuffer& first, const Buffers&... rest) {
   const auto type = first.element_type();
@@ -99,22 +107,23 @@ ffi::Error to_grains(ffi::AnyBuffer nodes, ffi::AnyBuffer m, ffi::AnyBuffer para
 }
 
 GeomTable geoms_of(Ints kind, Ints first, Ints nodes, Floats size, Floats reach, Floats origin, Floats spacing,
-                   const ffi::AnyBuffer& voxels) {
+                   const Shared& voxels) {
   return {int64_t(kind.size()), kind.begin(), first.begin(), nodes.begin(), size.begin(), reach.begin(), origin.begin(),
-          spacing.begin(), static_cast<const float*>(voxels.untyped_data())};
+          spacing.begin(), voxels};
 }
 
 ffi::Error near(ffi::AnyBuffer x, ffi::AnyBuffer high, ffi::AnyBuffer pos, ffi::AnyBuffer mat, ffi::AnyBuffer voxels,
                 ffi::Result<ffi::AnyBuffer> index, ffi::Result<ffi::AnyBuffer> found, Ints kind, Ints first, Ints nodes,
                 Floats size, Floats reach, Floats origin, Floats spacing, double low) {
   if (!alike(x, high, pos, mat) || voxels.element_type() != ffi::F32) return MIXED();
+  const auto all = index->dimensions();
   Near t{};
-  t.geoms = geoms_of(kind, first, nodes, size, reach, origin, spacing, voxels);
-  t.batch = batch_of(x, 2);
+  t.geoms = geoms_of(kind, first, nodes, size, reach, origin, spacing, shared(voxels, 1, all));
+  t.batch = batch_of(*index, 1);
   t.points = x.dimensions().back();
   t.room = index->dimensions().back();
   t.low = low;
-  t.x = x.untyped_data(); t.high = high.untyped_data(); t.pos = pos.untyped_data(); t.mat = mat.untyped_data();
+  t.x = shared(x, 2, all); t.high = shared(high, 1, all); t.pos = shared(pos, 2, all); t.mat = shared(mat, 3, all);
   t.index = static_cast<int32_t*>(index->untyped_data());
   t.found = static_cast<int32_t*>(found->untyped_data());
   (has_wide() ? wide::near : narrow::near)(t, x.element_type() == ffi::F64);
@@ -131,10 +140,11 @@ ffi::Error meet(ffi::AnyBuffer x, ffi::AnyBuffer v, ffi::AnyBuffer m, ffi::AnyBu
                 double layer) {
   if (!alike(x, v, m, pos, mat, centre, J, d, M, mu, hold, shares, q_free) || voxels.element_type() != ffi::F32)
     return MIXED();
+  const auto all = phi->dimensions();
   Meet t{};
-  t.geoms = geoms_of(kind, first, nodes, size, reach, origin, spacing, voxels);
+  t.geoms = geoms_of(kind, first, nodes, size, reach, origin, spacing, shared(voxels, 1, all));
   t.body_of = body_of.begin();
-  t.batch = batch_of(x, 2);
+  t.batch = batch_of(*phi, 1);
   t.points = x.dimensions().back();
   t.bodies = centre.dimensions()[centre.dimensions().size() - 2];
   t.nv = q_free.dimensions().back();
@@ -143,10 +153,10 @@ ffi::Error meet(ffi::AnyBuffer x, ffi::AnyBuffer v, ffi::AnyBuffer m, ffi::AnyBu
   t.plane_strain = plane_strain;
   t.reach = within;
   t.layer = layer;
-  t.x = x.untyped_data(); t.v = v.untyped_data(); t.m = m.untyped_data();
-  t.pos = pos.untyped_data(); t.mat = mat.untyped_data(); t.centre = centre.untyped_data();
-  t.J = J.untyped_data(); t.d = d.untyped_data(); t.M = M.untyped_data();
-  t.mu = mu.untyped_data(); t.hold = hold.untyped_data(); t.shares = shares.untyped_data(); t.q_free = q_free.untyped_data();
+  t.x = shared(x, 2, all); t.v = shared(v, 2, all); t.m = shared(m, 1, all);
+  t.pos = shared(pos, 2, all); t.mat = shared(mat, 3, all); t.centre = shared(centre, 2, all);
+  t.J = shared(J, 3, all); t.d = shared(d, 2, all); t.M = shared(M, 2, all); t.q_free = shared(q_free, 1, all);
+  t.mu = shared(mu, 2, all); t.hold = shared(hold, 1, all); t.shares = shared(shares, 2, all);
   t.phi = phi->untyped_data(); t.n = n->untyped_data(); t.q = q->untyped_data();
   t.impulse = impulse->untyped_data(); t.wrench = wrench->untyped_data();
   t.residual = residual->untyped_data(); t.scale = scale->untyped_data();

@@ -28,8 +28,8 @@ template <class S> struct Geom {
   int64_t nodes[3];
   S origin[3], spacing;
 
-  Geom(const GeomTable& t, int64_t g, const S* pos, const S* mat)
-      : kind(GeomKind(t.kind[g])), reach(S(t.reach[g])), index(int(g)), value(t.voxels + t.first[g]), spacing(S(t.spacing[g])) {
+  Geom(const GeomTable& t, int64_t g, const float* voxels, const S* pos, const S* mat)
+      : kind(GeomKind(t.kind[g])), reach(S(t.reach[g])), index(int(g)), value(voxels + t.first[g]), spacing(S(t.spacing[g])) {
     for (int i = 0; i < 3; ++i) {
       size[i] = S(t.size[3 * g + i]); at[i] = pos[3 * g + i];
       nodes[i] = t.nodes[3 * g + i]; origin[i] = S(t.origin[3 * g + i]);
@@ -46,10 +46,11 @@ template <class S> struct Geom {
   }
 };
 
-template <class S> std::vector<Geom<S>> placed(const GeomTable& t, const S* pos, const S* mat) {
+// The geoms of one environment, at pos (count, 3) with axes mat (count, 3, 3).
+template <class S> std::vector<Geom<S>> placed(const GeomTable& t, int64_t environment, const S* pos, const S* mat) {
   std::vector<Geom<S>> out;
   out.reserve(t.count);
-  for (int64_t g = 0; g < t.count; ++g) out.emplace_back(t, g, pos, mat);
+  for (int64_t g = 0; g < t.count; ++g) out.emplace_back(t, g, t.voxels.of<float>(environment), pos, mat);
   return out;
 }
 

@@ -31,6 +31,21 @@ struct ToGrains {
   void *x, *v, *C, *e, *tau, *history;
 };
 
+// An array of one environment each, or one for all: `per` numbers behind each other; in front of them as many dimensions
+// as `all` has, each as long as there or 1.
+struct Shared {
+  const void* data;
+  int64_t per, rank;
+  const int64_t *own, *all;
+
+  template <class S> const S* of(int64_t environment) const {
+    int64_t row = 0, stride = 1;
+    for (int64_t k = rank; k-- > 0; environment /= all[k], stride *= own[k])
+      if (own[k] > 1) row += environment % all[k] * stride;
+    return static_cast<const S*>(data) + row * per;
+  }
+};
+
 enum GeomKind : int64_t { PLANE = 0, SPHERE = 2, CAPSULE = 3, ELLIPSOID = 4, CYLINDER = 5, BOX = 6, MESH = 7 };  // MuJoCo's
 
 // Rigid geoms, but for where they are. A mesh has nodes[3 g ..] distances in `voxels` from its `first` one on.
@@ -38,7 +53,7 @@ struct GeomTable {
   int64_t count;
   const int64_t *kind, *first, *nodes;
   const double *size, *reach, *origin, *spacing;
-  const float* voxels;
+  Shared voxels;
 };
 
 // Points near geoms: which of them are between `low` and their own `high` away; `room` indices, `points` where there are
@@ -47,7 +62,7 @@ struct Near {
   GeomTable geoms;
   int64_t batch, points, room;
   double low;
-  const void *x, *high, *pos, *mat;
+  Shared x, high, pos, mat;
   int32_t *index, *found;
 };
 
@@ -59,7 +74,7 @@ struct Meet {
   int64_t batch, points, bodies, nv, materials, iterations;
   bool plane_strain;  // normals lie in the plane y = 0
   double reach, layer;
-  const void *x, *v, *m, *pos, *mat, *centre, *J, *d, *M, *mu, *hold, *shares, *q_free;
+  Shared x, v, m, pos, mat, centre, J, d, M, mu, hold, shares, q_free;
   void *phi, *n, *q, *impulse, *wrench, *residual, *scale;
 };
 

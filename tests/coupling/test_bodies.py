@@ -114,9 +114,8 @@ def coupled(model: mujoco.MjModel, *names: str) -> Bodies:
 
 
 def at_rest(b: Bodies) -> Any:
-    return jax.jit(
-        lambda: rigid.start(b, b.model.qpos0, np.zeros(b.model.nv), np.zeros(b.model.nu), mocap_poses(b.model))
-    )()
+    d = rigid.posed(b, b.model.qpos0, np.zeros(b.model.nv), np.zeros(b.model.nu), mocap_poses(b.model))
+    return jax.jit(lambda: rigid.start(b, d))()
 
 
 def mocap_poses(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:

@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from coupling.bodies import couple, start
+from coupling.bodies import couple, posed, start
 from mpm_env.wrench import Wrench, low_pass, wrench_at
 
 MODEL = """
@@ -31,7 +31,7 @@ class Standing:
         model = mujoco.MjModel.from_xml_string(MODEL)
         self.bodies = couple(model, {model.geom(n).id: (0.4,) for n in NAMES})
         none = (np.zeros((0, 3)), np.zeros((0, 4)))
-        self.rigid: Any = start(self.bodies, np.array([0.4, 0.1]), np.zeros(2), np.zeros(0), none)
+        self.rigid: Any = start(self.bodies, posed(self.bodies, np.array([0.4, 0.1]), np.zeros(2), np.zeros(0), none))
 
 
 @pytest.fixture(scope="module")
