@@ -121,7 +121,7 @@ class OnlyNodes(Contact):
     def nodes(self, touch: Touch, v: Array, m: Array) -> tuple[Touch, Array]:
         """See Contact."""
         done, change = super().nodes(touch, v, m)
-        return done._replace(q=touch.q), change
+        return done._replace(q=touch.q, time=touch.time, given=touch.given), change
 
     def grains(self, touch: Touch, p: Particles) -> tuple[Touch, Particles]:
         """Nothing happens to them."""

@@ -23,6 +23,7 @@ with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.St
     from mujoco import mjx  # prints that it lacks a package which nothing here uses
 from mujoco.mjx._src.types import IntegratorType
 
+from coupling.constraints import Laws, rows
 from coupling.contact import distances
 from coupling.exchange import Twists
 from coupling.geoms import Shape, bounding_radius, centre, half_extents, once, shape_of
@@ -69,7 +70,9 @@ class Stance(NamedTuple):
     J: Array  # (B, 6, nv)
     drift: Array  # (B, 6) prescribed twist of mocap bodies, m/s and rad/s
     M: Array  # (nv, nv) what the integrator solves
-    acceleration: Array  # (nv,) of the joints without grains
+    acceleration: Array  # (nv,) of the joints without grains and rigid constraints
+    q: Array  # (nv,) joint velocities at the start
+    laws: Laws  # of the rigid constraints
 
 
 def couple(model: mujoco.MjModel, geoms: dict[int, tuple[float, ...]]) -> Bodies:
@@ -81,6 +84,11 @@ def couple(model: mujoco.MjModel, geoms: dict[int, tuple[float, ...]]) -> Bodies
         raise ValueError(
             f"The model's integrator is {mujoco.mjtIntegrator(model.opt.integrator).name}, which cannot be solved"
             f" together with grains: choose {' or '.join(INTEGRATORS.values())}."
+        )
+    if model.nv and model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC and _collides(model):
+        raise ValueError(
+            "The model's friction cones are elliptic, which cannot be solved together with grains:"
+            ' choose <option cone="pyramidal"/>.'
         )
     try:
         mjx_model = mjx.put_model(model)
@@ -106,6 +114,11 @@ def couple(model: mujoco.MjModel, geoms: dict[int, tuple[float, ...]]) -> Bodies
         tuple(bodies.index(b) for b in carriers),
         tuple(mocap),
     )
+
+
+def _collides(model: mujoco.MjModel) -> bool:
+    """Whether any two geoms may touch each other."""
+    return bool(model.geom_contype.any() and model.geom_conaffinity.any()) or model.npair > 0
 
 
 def _jointed(model: mujoco.MjModel, body: int) -> bool:
@@ -226,20 +239,21 @@ def _carried(b: Bodies, d: Any) -> Any:
 
 
 def open_step(b: Bodies, d: Any, prescribed: Array) -> tuple[Any, Stance]:
-    """Forward dynamics without grains from fresh data d, and the stance that the grains will meet.
+    """Forward dynamics without grains and constraint forces from fresh data d, and the stance that the grains will meet.
 
     prescribed (B, 6): twists of the coupled bodies that hang on mocap bodies, zero for others (see drift).
     """
     model, nv = b.mjx_model, b.model.nv
     if b.steps:
-        # The load of the last step stays in, so that rigid constraints answer it; then it is taken out of the predictor
-        # again, since the exchange will find this step's load itself.
-        load = d.qfrc_applied
-        d = _forward(model, d)
+        d = d.replace(qfrc_applied=jnp.zeros_like(d.qfrc_applied))  # the last step's load
+        for stage in AFTER_PLACING:
+            d = stage(model, d)
         M = _integrated_mass(b, d)
-        acceleration = jnp.linalg.solve(M, d.qfrc_smooth + d.qfrc_constraint - load)
+        acceleration, laws = jnp.linalg.solve(M, d.qfrc_smooth), _laws(b, d, M)
     else:
         M, acceleration = jnp.zeros((0, 0), d.qpos.dtype), jnp.zeros((0,), d.qpos.dtype)
+        none = jnp.zeros((0,), d.qpos.dtype)
+        laws = Laws(M, M, none, none, none, none)
     bodies, geoms = np.asarray(b.bodies), np.asarray(b.geoms)
     centre_of_mass = d.xipos[bodies]
     lever = d.geom_xpos[geoms] - centre_of_mass[np.asarray(b.body_of)]
@@ -248,11 +262,11 @@ def open_step(b: Bodies, d: Any, prescribed: Array) -> tuple[Any, Stance]:
         J = jnp.stack([jnp.concatenate([jacp.T, jacr.T]) for jacp, jacr in pairs])
     else:
         J = jnp.zeros((len(bodies), 6, 0), d.qpos.dtype)
-    return d, Stance(centre_of_mass, lever, d.geom_xmat[geoms], J, prescribed, M, acceleration)
+    return d, Stance(centre_of_mass, lever, d.geom_xmat[geoms], J, prescribed, M, acceleration, d.qvel, laws)
 
 
-# What mjx.forward does after kinematics and com_pos, in its order: those two `refresh` has done, and they are half of
-# its compile time.
+# What mjx.forward does between com_pos and the constraint solver, in its order: what comes before, `refresh` has done,
+# which is half of the compile time, and what comes after, `close_step` does.
 AFTER_PLACING = (
     mjx.camlight,
     mjx.tendon,
@@ -270,12 +284,16 @@ AFTER_PLACING = (
 )
 
 
-def _forward(model: Any, d: Any) -> Any:
-    """mjx.forward of fresh data."""
-    for stage in AFTER_PLACING:
-        d = stage(model, d)
-    d = _constrained(model, d)
-    return mjx.sensor_acc(model, d)
+def _laws(b: Bodies, d: Any, M: Array) -> Laws:
+    """The rigid constraints as laws of the joint acceleration, in MuJoCo's order of rows."""
+    J, D, aref, most = d._impl.efc_J, d._impl.efc_D, d._impl.efc_aref, d._impl.efc_frictionloss
+    # Equalities pull both ways without bound, dry friction up to its loss; limits and contacts only push.
+    row = jnp.arange(J.shape[0])
+    equality, rubs = row < d._impl.ne, row < d._impl.ne + d._impl.nf
+    high = jnp.where(equality | ~rubs, jnp.inf, most).astype(J.dtype)
+    low = jnp.where(rubs, -high, 0).astype(J.dtype)
+    T = jnp.linalg.solve(mjx.full_m(b.mjx_model, d), M) if _damped(b) else jnp.eye(b.model.nv, dtype=M.dtype)
+    return Laws(J, T, D, aref, low, high)
 
 
 def _constrained(model: Any, d: Any) -> Any:
@@ -285,37 +303,46 @@ def _constrained(model: Any, d: Any) -> Any:
     return mjx.solve(model, d)
 
 
+def _damped(b: Bodies) -> bool:
+    """Whether the integrator solves more than the mass matrix: damping, or all that depends on velocity."""
+    if b.model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST:
+        return True
+    return not b.model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP and bool(b.model.dof_damping.any())
+
+
 def _integrated_mass(b: Bodies, d: Any) -> Array:
     """The matrix (nv, nv) that MJX's integrator solves, so that it lands on the velocity of the exchange."""
     model = b.mjx_model
     M = mjx.full_m(model, d)
     dt = b.model.opt.timestep
+    if not _damped(b):
+        return M
     if model.opt.integrator == IntegratorType.IMPLICITFAST:
         slope = mjx.deriv_smooth_vel(model, d)
         return M if slope is None else M - dt * slope
-    if b.model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP:
-        return M
     return M + dt * jnp.diag(model.dof_damping)
 
 
 def close_step(b: Bodies, d: Any, impulse: Array) -> Any:
     """Integrate one rigid step with the grains' summed generalised impulse (nv,) N s, N m s.
 
-    With the same matrix as in the exchange, the joint velocities come out as the exchange left them, unless a rigid
-    constraint changes its mind about the load.
+    With the same matrix and constraints as in the exchange, the joint velocities come out as the exchange left them.
     """
     if not b.steps:
         return d.replace(time=d.time + b.model.opt.timestep)
     model = b.mjx_model
     d = mjx.fwd_acceleration(model, d.replace(qfrc_applied=impulse / b.model.opt.timestep))
-    d = _constrained(model, d)
+    d = mjx.sensor_acc(model, _constrained(model, d))
     step = mjx.implicit if model.opt.integrator == IntegratorType.IMPLICITFAST else mjx.euler
     return step(model, d)
 
 
-def twists(s: Stance, centre_now: Array) -> Twists:
-    """How the bodies may move, at the given centres (B, 3) m."""
-    return Twists(centre_now, s.J, s.drift, s.M)
+def twists(s: Stance, centre_now: Array, time: Array, given: Array) -> Twists:
+    """How the bodies may move, at the given centres (B, 3) m.
+
+    That is `time` (s) after the rigid step's start; the rigid constraints had given (r,) N s a substep ago.
+    """
+    return Twists(centre_now, s.J, s.drift, s.M, rows(s.laws, s.q, time, given) if given.size else None)
 
 
 def poses(b: Bodies, s: Stance, centre_now: Array, turn: Array) -> tuple[Array, Array]:

@@ -3,10 +3,11 @@
 Each point is a lumped mass, so its post-contact velocity is known once the bodies' is: what remains is one equation in
 the nv joint velocities q,
 
-    M (q - q*) + sum_b J_b^T sum_i A_i^T lambda_i(v_i - A_i u_b) = 0,      u_b = J_b q + d_b,
+    M (q - q*) - J_c^T (p(q) - p_0) + sum_b J_b^T sum_i A_i^T lambda_i(v_i - A_i u_b) = 0,      u_b = J_b q + d_b,
 
-M the mass matrix that the integrator will use, q* the velocity without contact, A_i = [1, -[r_i]x] the point's lever,
-lambda_i the contact law, d_b the prescribed twist of a kinematic body. It is an inelastic collision: momentum is
+M the mass matrix that the integrator will use, q* the velocity without contact and constraints, p(q) the impulses of
+the rigid constraints along J_c and p_0 what they had given before (see constraints.py), A_i = [1, -[r_i]x] the point's
+lever, lambda_i the contact law, d_b the prescribed twist of a kinematic body. It is an inelastic collision: momentum is
 exchanged exactly and energy cannot rise, whatever the mass ratio. Solved by a semi-smooth Newton iteration that starts
 where every point sticks, with a line search on the residual; where it has not converged, impulses are scaled down until
 they dissipate.
@@ -20,11 +21,10 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from coupling.constraints import SOLVED, STEPS, Rows, pushes, settled, slope, firm_mass
 from coupling.contact import Points, Surface, cross, impulses, stiffness
 from coupling.geoms import dot, once
 
-STEPS = (1.0, 0.5, 0.25, 0.0625)  # line search candidates: full Newton steps where they help, small ones at kinks
-SOLVED = 4.0  # times rounding: an equation with no larger share left is not iterated any further
 NOISE = 1e-6  # share of the points' kinetic energy below which work is rounding, and not scaled
 
 
@@ -35,6 +35,7 @@ class Twists(NamedTuple):
     J: Array  # (B, 6, nv)
     d: Array  # (B, 6) m/s and rad/s
     M: Array  # (nv, nv) kg, kg m^2
+    rows: Rows | None = None  # of the rigid constraints; None where there are none
 
 
 class Exchange(NamedTuple):
@@ -45,12 +46,13 @@ class Exchange(NamedTuple):
     wrench: Array  # (G, 6) impulse wrench on each geom about its body's centre: N s and N m s
     residual: Array  # () share of the equation left unsolved, 0 when converged
     scale: Array  # () factor that kept the impulses dissipative, 1 when converged
+    given: Array  # (r,) N s, of the rigid constraints since the rigid step's start; (0,) where there are none
 
 
 def exchange(
     p: Points, t: Twists, q_free: Array, surface: Surface, body_of: tuple[int, ...], iterations: int
 ) -> Exchange:
-    """Impulses between points p and bodies t from the velocity q_free (nv,) that the bodies would have without them.
+    """Impulses between points p and bodies t from the velocity q_free (nv,) without them and without constraints.
 
     body_of is the body of each geom. No iterations are made when no coupled body can yield (nv == 0): then the law is
     explicit.
@@ -62,7 +64,7 @@ def exchange(
     if nv == 0:
         f = impulses(p, w, surface)
         zero = jnp.zeros((), p.v.dtype)
-        return Exchange(q_free, f, _per_geom(f, p, r, len(body_of)), zero, zero + 1)
+        return Exchange(q_free, f, _per_geom(f, p, r, len(body_of)), zero, zero + 1, jnp.zeros((0,), zero.dtype))
     # How the body's points under the grid points move with q: (3, nv, K).
     lever = _at(jnp.moveaxis(t.J, 0, -1)[..., body], r[:, None])
 
@@ -74,18 +76,26 @@ def exchange(
         """Generalised impulses (n, nv) of n times impulses f (3, n, K) on the bodies."""
         return jnp.sum(jnp.einsum("cik,cjk->cij", f, lever), axis=0)
 
+    zero, rows = jnp.zeros_like(q_free), t.rows
+    q_held, stuck_mass = q_free, t.M + pull(p.m * lever)
+    if rows:  # what they do without the points
+        held = settled(t.M, rows, q_free, zero, zero)
+        q_held = q_free + held.change
+        stuck_mass += firm_mass(rows, held.given)
     # The unknown is the change of q, not q: a heavy body's would drown in the rounding of q.
-    w_free = w - moved(q_free)
-    metric = jnp.linalg.inv(t.M + pull(p.m * lever))
+    w_free = w - moved(q_held)
+    metric = jnp.linalg.inv(stuck_mass)
 
     def best(changes: Array, w: Array) -> Newton:
         """The best of n changes (n, nv), with which points move with w (3, n, K) relative to their body."""
         R = changes @ t.M.T + pull(impulses(p, w, surface))
+        if rows:
+            R -= (pushes(rows, q_held + changes) - held.given) @ rows.J
         size = jnp.sqrt(jnp.maximum(jnp.sum((R @ metric) * R, axis=-1), 0))
         i = jnp.argmin(size)
         return Newton(changes[i], w[:, i], R[i], size[i], jnp.ones((), bool))
 
-    none = best(jnp.zeros_like(q_free)[None], w_free[:, None])
+    none = best(zero[None], w_free[:, None])
     enough = SOLVED * jnp.finfo(none.size.dtype).eps * none.size
 
     def nearer(old: Newton, step: Array, shares: Array) -> Newton:
@@ -99,6 +109,8 @@ def exchange(
     def newton(_: int, at: Newton) -> Newton:
         D = stiffness(p, at.w, surface)
         H = t.M + pull(jnp.stack([dot(row[:, None], lever) for row in D])).T
+        if rows:
+            H += slope(rows, q_held + at.change)
         return nearer(at, -jnp.linalg.solve(H, at.R), jnp.asarray(STEPS, at.R.dtype))
 
     stuck = metric @ pull((p.m * w_free)[:, None])[0]
@@ -107,7 +119,10 @@ def exchange(
     at = jax.lax.fori_loop(0, iterations, lambda i, at: jax.lax.cond(at.going, newton, lambda _, at: at, i, at), at)
     f = impulses(p, at.w, surface)
     pulled = pull(f[:, None])[0]
-    push = jnp.linalg.solve(t.M, pulled)  # what the bodies give: q = q_free - push
+    if rows:
+        push = held.change - settled(t.M, rows, q_free, -pulled, held.change + at.change).change
+    else:
+        push = jnp.linalg.solve(t.M, pulled)  # what the bodies give: q = q_held - push
     work = jnp.sum(f * w_free)
     doubled = jnp.sum(dot(f, f) / jnp.where(p.m > 0, p.m, 1)) + pulled @ push
     noise = NOISE * jnp.sum(p.m * dot(p.v, p.v))
@@ -115,7 +130,12 @@ def exchange(
     left = jnp.where(none.size**2 > noise, at.size / jnp.maximum(none.size, jnp.finfo(w.dtype).tiny), 0)
     scale = jnp.where(noticeable & (doubled > 0), jnp.clip(-work / jnp.where(doubled > 0, doubled, 1), 0, 1), 1)
     f = scale * f
-    return Exchange(q_free - scale * push, f, _per_geom(f, p, r, len(body_of)), left, scale)
+    wrench = _per_geom(f, p, r, len(body_of))
+    if not rows:
+        return Exchange(q_free - scale * push, f, wrench, left, scale, jnp.zeros((0,), f.dtype))
+    done = settled(t.M, rows, q_free, -scale * pulled, held.change - scale * push)
+    left = jnp.maximum(left, jnp.maximum(held.left, done.left))
+    return Exchange(q_free + done.change, f, wrench, left, scale, done.given)
 
 
 class Newton(NamedTuple):

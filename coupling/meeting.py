@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from coupling.constraints import Rows
 from coupling.contact import Points, Surface, distances, nearest_geom
 from coupling.exchange import Exchange, Twists, exchange
 from coupling.geoms import Shape, bounding_radius, dot
@@ -91,7 +92,9 @@ def meet(
         return Meeting(jnp.where(meets, phi, reach), jnp.where(meets, n, 0), done)
 
     def kernel(pos: Array, mat: Array, t: Twists, s: Surfaces, q_free: Array, x: Array, v: Array, m: Array) -> Meeting:
-        shapes = (m.shape, x.shape, q_free.shape, x.shape, (len(g.shapes), 6), (1,), (1,))
+        none = jnp.zeros((0,), x.dtype)
+        rows = t.rows or Rows(none[:, None] * q_free, t.M, *[none] * 5)
+        shapes = (m.shape, x.shape, q_free.shape, x.shape, (len(g.shapes), 6), (1,), (1,), rows.D.shape)
         call = jax.ffi.ffi_call(
             "mpm_env_meet", [jax.ShapeDtypeStruct(s, x.dtype) for s in shapes], vmap_method="expand_dims"
         )
@@ -103,9 +106,10 @@ def meet(
             "layer": np.float64(g.layer),
         }
         shares = jnp.zeros((0, 0), x.dtype) if s.shares is None else s.shares
-        arrays = (x, v, m, pos, mat, t.centre, t.J, t.d, t.M, s.mu, s.hold, shares, q_free)
-        phi, n, q, impulse, wrench, residual, scale = call(*arrays, _voxels(g), **_table(g), **attributes)
-        return Meeting(phi, n, Exchange(q, impulse, wrench, residual[0], scale[0]))
+        laws = jnp.stack([rows.D, rows.aim, rows.low, rows.high, rows.given])
+        arrays = (x, v, m, pos, mat, t.centre, t.J, t.d, t.M, s.mu, s.hold, shares, q_free, rows.J, rows.T, laws)
+        phi, n, q, impulse, wrench, residual, scale, given = call(*arrays, _voxels(g), **_table(g), **attributes)
+        return Meeting(phi, n, Exchange(q, impulse, wrench, residual[0], scale[0], given))
 
     either = native.differentiable(kernel, reference) if g.kernels == "native" else reference
     return either(pos, mat, t, s, q_free, x, v, m)

@@ -12,6 +12,7 @@ from jax import Array, lax
 
 from coupling import bodies as rigid
 from coupling.bodies import Stance
+from coupling.constraints import settled
 from coupling.contact import distances
 from coupling.geoms import bounding_radius, thickness
 from coupling.meeting import Geoms, Meeting, Surfaces, counted, found, meet, near
@@ -29,7 +30,9 @@ MOST_RESIDUAL = 0.1  # share of the exchange's equation that may stay unsolved b
 class Touch(NamedTuple):
     """What contact carries from substep to substep."""
 
+    time: Array  # () s since the start of the rigid step
     q: Array  # (nv,) joint velocities as the grains see them
+    given: Array  # (r,) N s, of the rigid constraints so far
     centre: Array  # (B, 3) m
     turn: Array  # (B, 3, 3) since the start of the rigid step
     impulse: Array  # (nv,) generalised impulse of the grains so far
@@ -86,12 +89,13 @@ class Contact(NamedTuple):
         s = self.stance
         zero = jnp.zeros((), s.centre.dtype)
         wrench = jnp.zeros((s.lever.shape[0], 6), s.centre.dtype)
-        return Touch(q, s.centre, _not_turned(s), jnp.zeros_like(q), wrench, zero, zero)
+        given = jnp.zeros_like(s.laws.D)
+        return Touch(zero, q, given, s.centre, _not_turned(s), jnp.zeros_like(q), wrench, zero, zero)
 
     def nodes(self, touch: Touch, v: Array, m: Array) -> tuple[Touch, Array]:
         """Exchange momentum between bodies and the grid nodes within the band."""
         reach = self.scene.fidelity.contact_band * self.scene.grid.cell_size
-        free = touch.q + self.scene.mpm_dt * self.stance.acceleration
+        touch, free = self._freed(touch)
         # A layer of nodes stands for a cell's width of surface each.
         area = self.scene.node_volume / self.scene.grid.cell_size
         surfaces = self._surfaces(self.shares, np.asarray(self.scene.adhesion) * area * self.scene.mpm_dt)
@@ -154,7 +158,16 @@ class Contact(NamedTuple):
 
     def coast(self, touch: Touch) -> Touch:
         """A substep without any grain."""
-        return self._moved(touch._replace(q=touch.q + self.scene.mpm_dt * self.stance.acceleration))
+        touch, q = self._freed(touch)
+        if rows := rigid.twists(self.stance, touch.centre, touch.time, touch.given).rows:
+            done = settled(self.stance.M, rows, q, jnp.zeros_like(q), jnp.zeros_like(q))
+            touch, q = touch._replace(given=done.given), q + done.change
+        return self._moved(touch._replace(q=q))
+
+    def _freed(self, touch: Touch) -> tuple[Touch, Array]:
+        """A substep on, and the joint velocities (nv,) then without grains and rigid constraints."""
+        h = self.scene.mpm_dt
+        return touch._replace(time=touch.time + h), touch.q + h * self.stance.acceleration
 
     def examined(self, touch: Touch) -> Array:
         """Health bits of this rigid step's contact."""
@@ -187,14 +200,15 @@ class Contact(NamedTuple):
         """Points against the bodies where they are now, whose joints move with free (nv,) without them."""
         b = self.scene.bodies
         assert b is not None
-        t = rigid.twists(self.stance, touch.centre)
+        t = rigid.twists(self.stance, touch.centre, touch.time, touch.given)
         if not b.yields:  # every coupled body goes where it is told: nothing to solve
-            t = t._replace(J=t.J[:, :, :0], M=t.M[:0, :0])
+            t = t._replace(J=t.J[:, :, :0], M=t.M[:0, :0], rows=None)
         pos, mat = rigid.poses(b, self.stance, touch.centre, touch.turn)
         met = meet(_geoms(self.scene), pos, mat, t, surfaces, free if b.yields else free[:0], x, v, m, reach)
         done = met.exchange
         return touch._replace(
             q=done.q if b.yields else free,
+            given=done.given if b.yields else touch.given,
             impulse=touch.impulse + self._generalised(done.wrench),
             wrench=touch.wrench + done.wrench,
             residual=jnp.maximum(touch.residual, done.residual),

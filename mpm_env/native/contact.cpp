@@ -133,8 +133,11 @@ template <class S> void run(const Meet& t, int64_t b) {
     mine[HOLD * W] = hold;
   }
 
-  const Outcome done = exchange<S>(crowd, Vector(M, M + nv * nv), energy, int(t.iterations));
-  for (int64_t j = 0; j < nv; ++j) ((S*)t.q)[b * nv + j] = S(q_free[j] - done.scale * done.push[j]);
+  Constraints rows{int(t.rows), int(nv)};
+  rows.read(t.rows_J.of<S>(b), t.rows_T.of<S>(b), t.rows_law.of<S>(b));
+  const Outcome done = exchange<S>(crowd, Vector(M, M + nv * nv), rows, Vector(q_free, q_free + nv), energy, int(t.iterations));
+  for (int64_t j = 0; j < nv; ++j) ((S*)t.q)[b * nv + j] = S(q_free[j] + done.change[j]);
+  for (int64_t j = 0; j < t.rows; ++j) ((S*)t.given)[b * t.rows + j] = S(done.given[j]);
   ((S*)t.residual)[b] = S(done.residual);
   ((S*)t.scale)[b] = S(done.scale);
 

@@ -6,15 +6,12 @@
 #include <limits>
 #include <vector>
 
+#include "constraints.h"
 #include "geoms.h"
 
 namespace MPM_ISA {
 
-constexpr double TINY = 1e-20, SOLVED = 4, NOISE = 1e-6;  // those of exchange.py and contact.py, as a test sees to
-constexpr int STEPS = 4;
-constexpr double STEP[STEPS] = {1, 0.5, 0.25, 0.0625};
-
-using Vector = std::vector<double>;
+constexpr double TINY = 1e-20, NOISE = 1e-6;  // those of exchange.py and contact.py, as a test sees to
 
 // The sum over lanes.
 template <class S> INLINE double total(const Pack<S>& a) {
@@ -23,28 +20,6 @@ template <class S> INLINE double total(const Pack<S>& a) {
   double sum[4] = {0, 0, 0, 0};
   for (int l = 0; l < W; ++l) sum[l % 4] += lane[l];
   return (sum[0] + sum[1]) + (sum[2] + sum[3]);
-}
-
-// Solves A X = B for X in place of B (n, columns), by elimination with row exchange; A is used up.
-inline void solve(Vector& A, Vector& B, int n, int columns) {
-  for (int k = 0; k < n; ++k) {
-    int best = k;
-    for (int i = k + 1; i < n; ++i) if (std::abs(A[i * n + k]) > std::abs(A[best * n + k])) best = i;
-    if (best != k) {
-      for (int j = 0; j < n; ++j) std::swap(A[k * n + j], A[best * n + j]);
-      for (int j = 0; j < columns; ++j) std::swap(B[k * columns + j], B[best * columns + j]);
-    }
-    for (int i = k + 1; i < n; ++i) {
-      const double share = A[i * n + k] / A[k * n + k];
-      for (int j = k + 1; j < n; ++j) A[i * n + j] -= share * A[k * n + j];
-      for (int j = 0; j < columns; ++j) B[i * columns + j] -= share * B[k * columns + j];
-    }
-  }
-  for (int i = n; i-- > 0;)
-    for (int j = 0; j < columns; ++j) {
-      for (int k = i + 1; k < n; ++k) B[i * columns + j] -= A[i * n + k] * B[k * columns + j];
-      B[i * columns + j] /= A[i * n + i];
-    }
 }
 
 enum CrowdRow { NORMAL = 0, SPEED = 3, MASS = 6, FRICTION = 7, HOLD = 8, LEVER = 9 };
@@ -92,15 +67,31 @@ template <class S> INLINE void stiffness(const Pack<S>* p, const Rows<S>& w, Pac
 // What the exchange did: its impulses are those of `impulses` times `scale`, with the points' w left in the crowd.
 struct Outcome {
   double residual = 0, scale = 1;
-  Vector push;  // (nv,) what the bodies gave: their joint velocities fall by scale * push
+  Vector change;  // (nv,) of the joint velocities
+  Vector given;   // of the rigid constraints
 };
 
-// Solves for the change of the joint velocities with mass matrix M (nv, nv), from points that move with w as they would
-// without contact. `energy` is twice the points' kinetic energy.
-template <class S> Outcome exchange(Crowd<S>& crowd, const Vector& M, double energy, int iterations) {
+// Solves for the change of the joint velocities q with mass matrix M (nv, nv), from points that move with w as they would
+// without contact and constraints. `energy` is twice the points' kinetic energy.
+template <class S>
+Outcome exchange(Crowd<S>& crowd, const Vector& M, const Constraints& rows, const Vector& q, double energy, int iterations) {
   const int nv = crowd.nv, packs = crowd.packs;
+  const double rounding = std::numeric_limits<S>::epsilon();
   Outcome out;
-  if (nv == 0 || packs == 0) { out.push.assign(nv, 0); return out; }
+  out.change.assign(nv, 0);
+  out.given = rows.given;
+  const bool constrained = nv && rows.count;
+  Settled held{out.change, out.given, 0};
+  if (constrained) held = rows.settled(M, q, Vector(nv, 0), Vector(nv, 0), rounding);
+  if (nv == 0 || packs == 0) { out.change = held.change; out.given = held.given; out.residual = held.left; return out; }
+  Vector q_held(q);
+  if (constrained) {
+    for (int a = 0; a < nv; ++a) q_held[a] += held.change[a];
+    for (int k = 0; k < packs; ++k) {
+      Pack<S>*p = crowd.of(k), *lever = p + LEVER;
+      for (int a = 0; a < nv; ++a) for (int i = 0; i < 3; ++i) p[SPEED + i] = p[SPEED + i] - S(held.change[a]) * lever[3 * a + i];
+    }
+  }
   std::vector<Pack<S>> scratch(size_t(packs) * 6 + size_t(STEPS) * nv + size_t(nv) * nv);
   Pack<S>* free = scratch.data();            // w without contact, three rows a pack
   Pack<S>* moved = free + 3 * size_t(packs);  // how the bodies' points move with a step
@@ -128,17 +119,19 @@ template <class S> Outcome exchange(Crowd<S>& crowd, const Vector& M, double ene
     stick[a] = total(stuck[a]);
     for (int b = 0; b <= a; ++b) { double m = total(sum[a * nv + b]); H[a * nv + b] += m; if (b < a) H[b * nv + a] += m; }
   }
+  for (int i = 0; i < rows.count; ++i)
+    if (held.given[i] > rows.low[i] && held.given[i] < rows.high[i])
+      for (int a = 0; a < nv; ++a)
+        for (int b = 0; b < nv; ++b) H[a * nv + b] += rows.D[i] * rows.J[i * nv + a] * rows.J[i * nv + b];
   solve(H, metric, nv, nv);
 
   // The equation's remainder for a change of q, and its size in the metric.
+  Vector moved_q(nv);
   auto left_over = [&](const Vector& change, const Pack<S>* pull, Vector& R) {
-    double square = 0;
-    for (int a = 0; a < nv; ++a) {
-      R[a] = total(pull[a]);
-      for (int b = 0; b < nv; ++b) R[a] += M[a * nv + b] * change[b];
-    }
-    for (int a = 0; a < nv; ++a) for (int b = 0; b < nv; ++b) square += R[a] * metric[b * nv + a] * R[b];
-    return std::sqrt(std::max(square, 0.0));
+    R = times(M, change);
+    for (int a = 0; a < nv; ++a) { R[a] += total(pull[a]); moved_q[a] = q_held[a] + change[a]; }
+    if (constrained) rows.take(rows.pushes(moved_q), held.given, R);
+    return length(metric, R);
   };
 
   Vector change(nv, 0), R(nv), tried(nv), R_tried(nv), best_change(nv), best_R(nv);
@@ -177,7 +170,7 @@ template <class S> Outcome exchange(Crowd<S>& crowd, const Vector& M, double ene
 
   size = std::numeric_limits<double>::infinity();
   nearer(Vector(nv, 0), 1);  // no contact: only what remains of the equation is wanted
-  const double none = size, enough = SOLVED * std::numeric_limits<S>::epsilon() * none;
+  const double none = size, enough = SOLVED * rounding * none;
   Vector step(nv, 0);
   for (int a = 0; a < nv; ++a) for (int b = 0; b < nv; ++b) step[a] += metric[a * nv + b] * stick[b];
   nearer(step, 1);
@@ -201,7 +194,8 @@ template <class S> Outcome exchange(Crowd<S>& crowd, const Vector& M, double ene
     }
     H = M;
     for (int j = 0; j < nv * nv; ++j) H[j] += total(sum[j]);
-    for (int a = 0; a < nv; ++a) step[a] = -R[a];
+    for (int a = 0; a < nv; ++a) { step[a] = -R[a]; moved_q[a] = q_held[a] + change[a]; }
+    if (constrained) rows.stiffen(moved_q, H);
     solve(H, step, nv, 1);
     going = nearer(step, STEPS) && size > enough;
   }
@@ -217,15 +211,28 @@ template <class S> Outcome exchange(Crowd<S>& crowd, const Vector& M, double ene
     doubled += total(dot<S>(f, f) / select<S>(p[MASS] > S(0), p[MASS], Pack<S>(S(1))));
     for (int a = 0; a < nv; ++a) sum[a] = sum[a] + f[0] * lever[3 * a] + f[1] * lever[3 * a + 1] + f[2] * lever[3 * a + 2];
   }
-  out.push.resize(nv);
-  for (int a = 0; a < nv; ++a) out.push[a] = total(sum[a]);
-  Vector pulled(out.push);
-  H = M;
-  solve(H, out.push, nv, 1);
-  for (int a = 0; a < nv; ++a) doubled += pulled[a] * out.push[a];
+  Vector pulled(nv), push(nv);  // push: what the bodies give, their joint velocities fall by it
+  for (int a = 0; a < nv; ++a) push[a] = pulled[a] = total(sum[a]);
+  if (constrained) {
+    Vector load(nv), guess(nv);
+    for (int a = 0; a < nv; ++a) { load[a] = -pulled[a]; guess[a] = held.change[a] + change[a]; }
+    const Settled whole = rows.settled(M, q, load, guess, rounding);
+    for (int a = 0; a < nv; ++a) push[a] = held.change[a] - whole.change[a];
+  } else {
+    H = M;
+    solve(H, push, nv, 1);
+  }
+  for (int a = 0; a < nv; ++a) doubled += pulled[a] * push[a];
   const double noise = NOISE * energy;
   if (none * none > noise) out.residual = size / std::max(none, double(std::numeric_limits<S>::min()));
   if (std::abs(work) > noise && doubled > 0) out.scale = std::min(std::max(-work / doubled, 0.0), 1.0);
+  for (int a = 0; a < nv; ++a) { out.change[a] = held.change[a] - out.scale * push[a]; pulled[a] *= -out.scale; }
+  if (constrained) {
+    const Settled done = rows.settled(M, q, pulled, out.change, rounding);
+    out.change = done.change;
+    out.given = done.given;
+    out.residual = std::max({out.residual, held.left, done.left});
+  }
   return out;
 }
 

@@ -132,13 +132,15 @@ ffi::Error near(ffi::AnyBuffer x, ffi::AnyBuffer high, ffi::AnyBuffer pos, ffi::
 
 ffi::Error meet(ffi::AnyBuffer x, ffi::AnyBuffer v, ffi::AnyBuffer m, ffi::AnyBuffer pos, ffi::AnyBuffer mat,
                 ffi::AnyBuffer centre, ffi::AnyBuffer J, ffi::AnyBuffer d, ffi::AnyBuffer M, ffi::AnyBuffer mu,
-                ffi::AnyBuffer hold, ffi::AnyBuffer shares, ffi::AnyBuffer q_free, ffi::AnyBuffer voxels, ffi::Result<ffi::AnyBuffer> phi,
+                ffi::AnyBuffer hold, ffi::AnyBuffer shares, ffi::AnyBuffer q_free, ffi::AnyBuffer rows_J,
+                ffi::AnyBuffer rows_T, ffi::AnyBuffer rows_law, ffi::AnyBuffer voxels, ffi::Result<ffi::AnyBuffer> phi,
                 ffi::Result<ffi::AnyBuffer> n, ffi::Result<ffi::AnyBuffer> q, ffi::Result<ffi::AnyBuffer> impulse,
                 ffi::Result<ffi::AnyBuffer> wrench, ffi::Result<ffi::AnyBuffer> residual,
-                ffi::Result<ffi::AnyBuffer> scale, Ints kind, Ints first, Ints nodes, Floats size, Floats reach,
+                ffi::Result<ffi::AnyBuffer> scale, ffi::Result<ffi::AnyBuffer> given, Ints kind, Ints first, Ints nodes, Floats size, Floats reach,
                 Floats origin, Floats spacing, Ints body_of, int64_t iterations, bool plane_strain, double within,
                 double layer) {
-  if (!alike(x, v, m, pos, mat, centre, J, d, M, mu, hold, shares, q_free) || voxels.element_type() != ffi::F32)
+  if (!alike(x, v, m, pos, mat, centre, J, d, M, mu, hold, shares, q_free, rows_J, rows_T, rows_law) ||
+      voxels.element_type() != ffi::F32)
     return MIXED();
   const auto all = phi->dimensions();
   Meet t{};
@@ -149,6 +151,7 @@ ffi::Error meet(ffi::AnyBuffer x, ffi::AnyBuffer v, ffi::AnyBuffer m, ffi::AnyBu
   t.bodies = centre.dimensions()[centre.dimensions().size() - 2];
   t.nv = q_free.dimensions().back();
   t.materials = hold.dimensions().back();
+  t.rows = rows_law.dimensions().back();
   t.iterations = iterations;
   t.plane_strain = plane_strain;
   t.reach = within;
@@ -157,8 +160,9 @@ ffi::Error meet(ffi::AnyBuffer x, ffi::AnyBuffer v, ffi::AnyBuffer m, ffi::AnyBu
   t.pos = shared(pos, 2, all); t.mat = shared(mat, 3, all); t.centre = shared(centre, 2, all);
   t.J = shared(J, 3, all); t.d = shared(d, 2, all); t.M = shared(M, 2, all); t.q_free = shared(q_free, 1, all);
   t.mu = shared(mu, 2, all); t.hold = shared(hold, 1, all); t.shares = shared(shares, 2, all);
+  t.rows_J = shared(rows_J, 2, all); t.rows_T = shared(rows_T, 2, all); t.rows_law = shared(rows_law, 2, all);
   t.phi = phi->untyped_data(); t.n = n->untyped_data(); t.q = q->untyped_data();
-  t.impulse = impulse->untyped_data(); t.wrench = wrench->untyped_data();
+  t.impulse = impulse->untyped_data(); t.wrench = wrench->untyped_data(); t.given = given->untyped_data();
   t.residual = residual->untyped_data(); t.scale = scale->untyped_data();
   (has_wide() ? wide::meet : narrow::meet)(t, x.element_type() == ffi::F64);
   return ffi::Error::Success();
@@ -182,8 +186,8 @@ XLA_FFI_DEFINE_HANDLER_SYMBOL(mpm_env_to_grains, to_grains,
 XLA_FFI_DEFINE_HANDLER_SYMBOL(mpm_env_near, near,
                               ffi::Ffi::Bind().ARG.ARG.ARG.ARG.ARG.RET.RET GEOM_ATTRIBUTES.Attr<double>("low"));
 XLA_FFI_DEFINE_HANDLER_SYMBOL(mpm_env_meet, meet,
-                              ffi::Ffi::Bind().ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.RET.RET.RET.RET.RET
-                                  .RET.RET
+                              ffi::Ffi::Bind().ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG
+                                  .RET.RET.RET.RET.RET.RET.RET.RET
                                   GEOM_ATTRIBUTES.Attr<Ints>("body_of").Attr<int64_t>("iterations")
                                   .Attr<bool>("plane_strain").Attr<double>("within")
                                   .Attr<double>("layer"));

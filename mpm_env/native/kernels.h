@@ -71,11 +71,11 @@ struct Near {
 struct Meet {
   GeomTable geoms;
   const int64_t* body_of;
-  int64_t batch, points, bodies, nv, materials, iterations;
+  int64_t batch, points, bodies, nv, materials, rows, iterations;
   bool plane_strain;  // normals lie in the plane y = 0
   double reach, layer;
-  Shared x, v, m, pos, mat, centre, J, d, M, mu, hold, shares, q_free;
-  void *phi, *n, *q, *impulse, *wrench, *residual, *scale;
+  Shared x, v, m, pos, mat, centre, J, d, M, mu, hold, shares, q_free, rows_J, rows_T, rows_law;
+  void *phi, *n, *q, *impulse, *wrench, *residual, *scale, *given;
 };
 
 #define DECLARE(isa)                          \

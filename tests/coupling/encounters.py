@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from coupling.constraints import Rows
 from coupling.exchange import Twists
 from coupling.geoms import Shape, Voxels
 from coupling.meeting import Geoms, Meeting, Surfaces, meet, near
@@ -268,6 +269,25 @@ def _twists(nv: int, mass: float, told: float, rng: np.random.Generator) -> Twis
         J, A = rng.normal(size=(3, 6, nv)), rng.normal(size=(nv, nv))
         M = A @ A.T / max(nv, 1) + 0.1 * np.eye(nv)
     return Twists(rng.uniform(-0.6, 0.6, (3, 3)), J, told * rng.normal(size=(3, 6)), mass * M)
+
+
+@cache
+def constrained(dtype: str) -> Case:
+    """The mechanism of nine joints, some of which rigid constraints hold: an equality, dry friction, limits."""
+    case, rng = encounters(9).case, np.random.default_rng(11)
+    count, nv, r = *case.q_free.shape, 6
+    J = rng.normal(size=(count, r, nv))
+    undamped = case.t.M - 0.1 * np.linalg.eigvalsh(case.t.M)[:, :1, None] * np.eye(nv)
+    T = np.linalg.solve(undamped, case.t.M)
+    heavy = np.trace(case.t.M, axis1=1, axis2=2)[:, None] / nv  # kg, as bodies are
+    free, one = heavy * np.inf, np.ones((count, 1))
+    low = np.concatenate([-free, -0.3 * heavy, *[0 * heavy] * 4], axis=1)
+    high = np.concatenate([free, 0.3 * heavy, *[free] * 4], axis=1)
+    D = heavy * 10 ** rng.uniform(-1, 2, (count, r))
+    aim = np.concatenate([rng.normal(size=(count, r - 1)), -50 * one], axis=1)  # the last limit is far away
+    given = np.clip(0.1 * heavy * rng.normal(size=(count, r)), low, high)
+    rows = Rows(J, T, D, aim, low, high, given)
+    return in_precision(case._replace(t=case.t._replace(rows=rows)), dtype)
 
 
 def padded(case: Case) -> Case:

@@ -307,7 +307,7 @@ def test_the_explicit_law_raises_the_energy_of_the_same_instances() -> None:
     i = free_bodies()
     f = law(i, relative(i, i.q_free, (0,)))
     q = i.q_free - np.linalg.solve(i.t.M, np.einsum("ekcn,ekc->en", levers(i, (0,)), f)[..., None])[..., 0]
-    before, after = energies(i, Exchange(q, f, *[None] * 3))  # type: ignore[arg-type]
+    before, after = energies(i, Exchange(q, f, *[None] * 4))  # type: ignore[arg-type]
     light = np.repeat(np.array(RATIOS), len(FRICTIONS) * len(FIELDS) * COPIES) == min(RATIOS)
     assert np.min((after / before)[light]) > EXPLICIT_GAIN
 
