@@ -239,7 +239,7 @@ def _carried(b: Bodies, d: Any) -> Any:
 
 
 def open_step(b: Bodies, d: Any, prescribed: Array) -> tuple[Any, Stance]:
-    """Forward dynamics without grains and constraint forces from fresh data d, and the stance that the grains will meet.
+    """Forward dynamics of fresh data d, but for grains and constraints, and the stance that the grains will meet.
 
     prescribed (B, 6): twists of the coupled bodies that hang on mocap bodies, zero for others (see drift).
     """

@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from coupling.constraints import SOLVED, STEPS, Rows, pushes, settled, slope, firm_mass
+from coupling.constraints import SOLVED, STEPS, Rows, firm_mass, pushes, settled, slope
 from coupling.contact import Points, Surface, cross, impulses, stiffness
 from coupling.geoms import dot, once
 

@@ -31,6 +31,9 @@ class Fidelity(Section):
     )
     contact_band: Annotated[float, Field(ge=0, le=1)] = Field(0.5, description="cells off a body where nodes feel it")
     contact_iterations: int = Field(4, ge=1, le=20, description="Newton iterations of the momentum exchange")
+    two_way: bool = Field(
+        True, description="grains push bodies; if not, bodies go as if there were none, and nothing is solved"
+    )
     push_out: bool = Field(
         True, description="grains inside a body are put back to its surface, so thin tools do not leak"
     )

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from enum import IntFlag
+from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
 
 MOST_DEPTH = 0.5  # cells a grain may stand inside a body before contact is called lost
 MOST_TRAVEL = 0.25  # cells a body may move in one rigid step: the points near it are looked up once per rigid step
+MOST_ASTRAY = 0.1  # cells by which a rigid step may end apart from where grains saw the bodies go
+MOST_UNPAID = 1e-3  # share of the exchanged impulse by which what grains got and what bodies got may differ
 
 
 class Health(IntFlag):
@@ -24,6 +27,8 @@ class Health(IntFlag):
     GRAINS_OVERFLOW = 64
     NOT_CONVERGED = 128
     BODY_TOO_FAST = 256
+    BODY_ASTRAY = 512
+    NOT_PAID = 1024
 
 
 SENTENCES: dict[Health, str] = {
@@ -36,7 +41,19 @@ SENTENCES: dict[Health, str] = {
     Health.GRAINS_OVERFLOW: "More grains are near bodies than were set aside: contact is incomplete.",
     Health.NOT_CONVERGED: "Contact between grains and bodies was not solved: raise contact_iterations.",
     Health.BODY_TOO_FAST: "A body moved over a quarter of a cell in one rigid step: use a smaller fidelity.rigid_dt.",
+    Health.BODY_ASTRAY: "MJX moved a body otherwise than its grains saw: raise the model's option iterations.",
+    Health.NOT_PAID: "Grains and bodies did not get opposite impulses: contact lost digits, use precision f64.",
 }
+
+
+class ContactReport(NamedTuple):
+    """How contact went in a rigid step: numbers to watch, each with a health bit for when it is too much."""
+
+    depth: Array  # () m, deepest grain inside a body before it was stopped
+    peak: Array  # () N, largest force on the bodies over a substep; with the mean force, how rough contact is
+    unpaid: Array  # () share of the exchanged impulse by which what grains got and what bodies got differ
+    unsolved: Array  # () worst share of the exchange's equation left over
+    astray: Array  # () m, how far MJX left the bodies from where the grains saw them go
 
 
 def sentences(bits: int) -> list[str]:

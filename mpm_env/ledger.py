@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from mpm_env.health import ContactReport
 from mpm_env.mpm.budgets import budgets, total
 from mpm_env.scene import Scene, State
 from mpm_env.scene_config import SnowConfig
@@ -49,6 +50,7 @@ class Ledger:
             **self._of_grains(state),
             **self._of_snow(state),
             **self._of_bodies(state, view),
+            **self._of_contact(state),
         }
         for key, value in row.items():
             self.frames.setdefault(key, []).append(value)
@@ -62,6 +64,7 @@ class Ledger:
             "energy/bodies_kinetic_J": row["bodies_kinetic"],
             "energy/bodies_potential_J": row["bodies_potential"],
             "health/bits": float(row["health"]),
+            **{f"contact/{key}": row[f"contact_{key}"] for key in ContactReport._fields if self.scene.bodies},
         }
 
     def snapshot(self, state: State, view: View) -> None:
@@ -84,7 +87,8 @@ class Ledger:
         angular_momentum (f, 3) kg m^2/s about the world's origin, kinetic, elastic, potential (f,) J; the same of the
         bodies as bodies_*, potential zero at z = 0; snapshot_time (s,) s, snapshot_x (s, n, 3) m, snapshot_v (s, n, 3)
         m/s, snapshot_mass (s, n) kg, snapshot_material (n,), snapshot_history (s, h, n) what the materials remember, of
-        snow ln J_P; with snow also J_P (f, q, 2), the least and the greatest of its grains.
+        snow ln J_P; with snow also J_P (f, q, 2), the least and the greatest of its grains; with bodies also contact_*
+        (f,), the fields of health.ContactReport, of the last rigid step before each frame.
         """
         scene = self.scene
         b = scene.bodies
@@ -141,6 +145,12 @@ class Ledger:
             assert isinstance(material, SnowConfig)
             found.append({"J_P_least": float(J_P.min()), "J_P_greatest": float(J_P.max()), "Jp_min": material.Jp_min})
         return found
+
+    def _of_contact(self, state: State) -> dict[str, float]:
+        """How contact went in the last rigid step."""
+        if state.contact is None:
+            return {}
+        return {f"contact_{key}": float(value) for key, value in state.contact._asdict().items()}
 
     def _of_mass(self, state: State) -> dict[str, float]:
         """Mass there and mass gone, grain by grain: together they are the mass at the start to the last bit."""

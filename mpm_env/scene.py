@@ -17,7 +17,7 @@ from coupling.bodies import Bodies, distances_from, posed, refresh, start
 from mpm_env import native
 from mpm_env.config import nearest
 from mpm_env.fidelity import Fidelity
-from mpm_env.health import MOST_TRAVEL
+from mpm_env.health import MOST_TRAVEL, ContactReport
 from mpm_env.motion import Motion
 from mpm_env.mpm import seeding
 from mpm_env.mpm.materials import Material
@@ -94,7 +94,7 @@ class Scene:
 
 @partial(
     jax.tree_util.register_dataclass,
-    data_fields=["rigid", "grains", "order", "materials", "steps", "health", "left", "reaction"],
+    data_fields=["rigid", "grains", "order", "materials", "steps", "health", "left", "reaction", "contact"],
     meta_fields=[],
 )
 @dataclass(frozen=True)
@@ -109,6 +109,7 @@ class State:
     health: Array  # () int32, sticky bits of mpm_env.health.Health
     left: Array  # () kg that left through open walls
     reaction: Array  # (G, 6) N and N m on each coupled geom about its body's centre, mean over the last rigid step
+    contact: ContactReport | None  # how contact went in the last rigid step; None where a scene has no bodies
 
     @property
     def grains_at_home(self) -> Particles:
@@ -230,6 +231,7 @@ def initial(scene: Scene, key: Array, *, qpos: Array | None = None) -> State:
         health=jnp.zeros((), jnp.int32),
         left=jnp.zeros((), scene.dtype),
         reaction=jnp.zeros((geoms, 6), scene.dtype),
+        contact=ContactReport(*[jnp.zeros((), scene.dtype)] * 5) if scene.bodies else None,
     )
     # MJX commits its arrays to a device. The others go along, or the first step would compile a second time.
     return jax.device_put(state, jax.devices()[0])

@@ -72,14 +72,16 @@ def rigid_step(scene: Scene, state: State, drive: Drive) -> State:
     grains, touch = _run_grains(scene, state, contact, touch)
     d = rigid.close_step(b, d, touch.impulse.astype(d.qvel.dtype))
     d = rigid.refresh(b, rigid.place(d, drive.position, drive.quaternion))
+    report = contact.report(touch, d.qvel.astype(scene.dtype))
     after = replace(
         state,
         rigid=d,
         grains=grains,
         steps=state.steps + 1,
         reaction=touch.wrench / jnp.asarray(scene.rigid_dt, scene.dtype),
+        contact=report,
     )
-    return _examined(scene, state, after, contact.examined(touch))
+    return _examined(scene, state, after, contact.examined(touch, report))
 
 
 def _run_grains(scene: Scene, state: State, contact: Contact | None = None, touch: Any = None) -> Any:

@@ -16,7 +16,15 @@ from coupling.constraints import settled
 from coupling.contact import distances
 from coupling.geoms import bounding_radius, thickness
 from coupling.meeting import Geoms, Meeting, Surfaces, counted, found, meet, near
-from mpm_env.health import MOST_DEPTH, MOST_TRAVEL, Health, as_bits
+from mpm_env.health import (
+    MOST_ASTRAY,
+    MOST_DEPTH,
+    MOST_TRAVEL,
+    MOST_UNPAID,
+    ContactReport,
+    Health,
+    as_bits,
+)
 from mpm_env.mpm.substep import to_nodes
 from mpm_env.mpm.types import Particles
 from mpm_env.scene import Scene, lift
@@ -38,6 +46,9 @@ class Touch(NamedTuple):
     impulse: Array  # (nv,) generalised impulse of the grains so far
     wrench: Array  # (G, 6) impulse wrench on each geom so far, N s and N m s
     depth: Array  # () m, deepest grain inside a body so far
+    peak: Array  # () N s, largest impulse of a substep on the bodies so far
+    unpaid: Array  # () N s, by which what grains got and what bodies got differ so far
+    exchanged: Array  # () N s, sum of the sizes of all impulses so far
     residual: Array  # () worst share of an exchange left unsolved
 
 
@@ -90,12 +101,14 @@ class Contact(NamedTuple):
         zero = jnp.zeros((), s.centre.dtype)
         wrench = jnp.zeros((s.lever.shape[0], 6), s.centre.dtype)
         given = jnp.zeros_like(s.laws.D)
-        return Touch(zero, q, given, s.centre, _not_turned(s), jnp.zeros_like(q), wrench, zero, zero)
+        return Touch(zero, q, given, s.centre, _not_turned(s), jnp.zeros_like(q), wrench, *[zero] * 5)
 
     def nodes(self, touch: Touch, v: Array, m: Array) -> tuple[Touch, Array]:
         """Exchange momentum between bodies and the grid nodes within the band."""
         reach = self.scene.fidelity.contact_band * self.scene.grid.cell_size
         touch, free = self._freed(touch)
+        if not self.scene.fidelity.two_way:
+            touch, free = self._settled(touch, free)
         # A layer of nodes stands for a cell's width of surface each.
         area = self.scene.node_volume / self.scene.grid.cell_size
         surfaces = self._surfaces(self.shares, np.asarray(self.scene.adhesion) * area * self.scene.mpm_dt)
@@ -158,33 +171,52 @@ class Contact(NamedTuple):
 
     def coast(self, touch: Touch) -> Touch:
         """A substep without any grain."""
-        touch, q = self._freed(touch)
-        if rows := rigid.twists(self.stance, touch.centre, touch.time, touch.given).rows:
-            done = settled(self.stance.M, rows, q, jnp.zeros_like(q), jnp.zeros_like(q))
-            touch, q = touch._replace(given=done.given), q + done.change
+        touch, q = self._settled(*self._freed(touch))
         return self._moved(touch._replace(q=q))
+
+    def _settled(self, touch: Touch, q: Array) -> tuple[Touch, Array]:
+        """What rigid constraints make of joint velocities q (nv,) where no grain pushes."""
+        rows = rigid.twists(self.stance, touch.centre, touch.time, touch.given).rows
+        if rows is None:
+            return touch, q
+        done = settled(self.stance.M, rows, q, jnp.zeros_like(q), jnp.zeros_like(q))
+        return touch._replace(given=done.given), q + done.change
 
     def _freed(self, touch: Touch) -> tuple[Touch, Array]:
         """A substep on, and the joint velocities (nv,) then without grains and rigid constraints."""
         h = self.scene.mpm_dt
         return touch._replace(time=touch.time + h), touch.q + h * self.stance.acceleration
 
-    def examined(self, touch: Touch) -> Array:
+    def report(self, touch: Touch, q: Array) -> ContactReport:
+        """How contact went, when MJX left the joint velocities q (nv,)."""
+        exchanged = jnp.where(touch.exchanged > 0, touch.exchanged, 1)
+        astray = self._speed(self.stance.J @ (q - touch.q)) * self.scene.rigid_dt
+        peak = touch.peak / self.scene.mpm_dt
+        return ContactReport(touch.depth, peak, touch.unpaid / exchanged, touch.residual, astray)
+
+    def examined(self, touch: Touch, report: ContactReport) -> Array:
         """Health bits of this rigid step's contact."""
         b, dx = self.scene.bodies, self.scene.grid.cell_size
         assert b is not None
-        twist = self.stance.J @ touch.q + self.stance.drift
-        reach = jnp.asarray([_reach(b, i) for i in range(len(b.bodies))], touch.centre.dtype)
-        speed = jnp.linalg.norm(twist[:, :3], axis=-1) + reach * jnp.linalg.norm(twist[:, 3:], axis=-1)
+        travel = self._speed(self.stance.J @ touch.q + self.stance.drift) * self.scene.rigid_dt
         return as_bits(
             {
-                Health.TOO_DEEP: touch.depth > min(MOST_DEPTH * dx, *(HALFWAY * thickness(s) / 2 for s in b.shapes)),
+                Health.TOO_DEEP: report.depth > min(MOST_DEPTH * dx, *(HALFWAY * thickness(s) / 2 for s in b.shapes)),
                 Health.NODES_OVERFLOW: self.nodes_over,
                 Health.GRAINS_OVERFLOW: self.grains_over,
-                Health.NOT_CONVERGED: touch.residual > MOST_RESIDUAL,
-                Health.BODY_TOO_FAST: jnp.max(speed) * self.scene.rigid_dt > MOST_TRAVEL * dx,
+                Health.NOT_CONVERGED: report.unsolved > MOST_RESIDUAL,
+                Health.BODY_TOO_FAST: travel > MOST_TRAVEL * dx,
+                Health.BODY_ASTRAY: report.astray > MOST_ASTRAY * dx,
+                Health.NOT_PAID: report.unpaid > MOST_UNPAID,
             }
         )
+
+    def _speed(self, twist: Array) -> Array:
+        """Speed () m/s of the fastest point of the coupled bodies, which move with these twists (B, 6)."""
+        b = self.scene.bodies
+        assert b is not None
+        reach = jnp.asarray([_reach(b, i) for i in range(len(b.bodies))], twist.dtype)
+        return jnp.max(jnp.linalg.norm(twist[:, :3], axis=-1) + reach * jnp.linalg.norm(twist[:, 3:], axis=-1))
 
     def _surfaces(self, shares: Array | None, hold: np.ndarray) -> Surfaces:
         """How bodies are to points with these shares (M, K) of the materials, held back by up to hold (M,) N s."""
@@ -201,16 +233,21 @@ class Contact(NamedTuple):
         b = self.scene.bodies
         assert b is not None
         t = rigid.twists(self.stance, touch.centre, touch.time, touch.given)
-        if not b.yields:  # every coupled body goes where it is told: nothing to solve
-            t = t._replace(J=t.J[:, :, :0], M=t.M[:0, :0], rows=None)
+        solved = b.yields and self.scene.fidelity.two_way
+        if not solved:  # every coupled body goes where it is told, or where its joints take it: nothing to solve
+            t = t._replace(J=t.J[:, :, :0], M=t.M[:0, :0], rows=None, d=t.d + t.J @ free)
         pos, mat = rigid.poses(b, self.stance, touch.centre, touch.turn)
-        met = meet(_geoms(self.scene), pos, mat, t, surfaces, free if b.yields else free[:0], x, v, m, reach)
+        met = meet(_geoms(self.scene), pos, mat, t, surfaces, free if solved else free[:0], x, v, m, reach)
         done = met.exchange
+        onto = jnp.sum(done.wrench[:, :3], axis=0)
         return touch._replace(
-            q=done.q if b.yields else free,
-            given=done.given if b.yields else touch.given,
-            impulse=touch.impulse + self._generalised(done.wrench),
+            q=done.q if solved else free,
+            given=done.given if solved else touch.given,
+            impulse=touch.impulse + self._generalised(done.wrench) if self.scene.fidelity.two_way else touch.impulse,
             wrench=touch.wrench + done.wrench,
+            peak=jnp.maximum(touch.peak, jnp.linalg.norm(onto)),
+            unpaid=touch.unpaid + jnp.linalg.norm(onto + jnp.sum(done.impulse, axis=-1)),
+            exchanged=touch.exchanged + jnp.sum(jnp.abs(done.impulse)),
             residual=jnp.maximum(touch.residual, done.residual),
         ), met
 

@@ -203,6 +203,14 @@ template <class S> INLINE Pack<S> group_sums(Pack<S> a, Pack<S> b, Pack<S> c, Pa
     Pack<S> r;
     r.p[0] = (typename Pack<S>::Part)(_mm512_shuffle_f32x4(u, w, 0x88) + _mm512_shuffle_f32x4(u, w, 0xdd));
     return r;
+  } else {
+    auto pair = [](const Pack<S>& a, const Pack<S>& b) {
+      __m512d A = (__m512d)(a.p[0] + a.p[1]), B = (__m512d)(b.p[0] + b.p[1]);
+      return (typename Pack<S>::Part)(_mm512_shuffle_f64x2(A, B, 0x44) + _mm512_shuffle_f64x2(A, B, 0xee));
+    };
+    Pack<S> r;
+    r.p[0] = pair(a, b); r.p[1] = pair(c, d);
+    return r;
   }
 #endif
   typedef S Quad __attribute__((vector_size(4 * sizeof(S))));

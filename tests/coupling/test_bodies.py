@@ -232,7 +232,7 @@ def test_a_step_from_fresh_data_is_mjx_step() -> None:
 @pytest.mark.parametrize("integrator", ["Euler", "implicitfast"])
 def test_the_exchange_foresees_what_all_constraints_of_mujoco_do(integrator: str) -> None:
     """With a weld, limits, dry friction, contact, damping: joints end a step where the grains last saw them."""
-    b = coupled(model_of(EVERYTHING.replace('<option', f'<option integrator="{integrator}"')), "palm", "link")
+    b = coupled(model_of(EVERYTHING.replace("<option", f'<option integrator="{integrator}"')), "palm", "link")
     d, load = everything_moving(b)
     still = jnp.zeros((len(b.bodies), 6))
 

@@ -1,0 +1,83 @@
+"""A box dropped on sand, light or heavy: does it bounce, settle, weigh what it weighs, and where does it rest?
+
+The box of 20 x 20 x 10 cm falls 5 cm on a bed 20 cm deep, as in Newton's example. Below it all stands a rigid floor,
+which boxes a hundred times as dense as sand sink down to.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+
+from benchmarks.coupling.scenes import RHO, Bed, G, body_energy, lighter, run, trouble
+
+RATIOS = (0.01, 0.1, 1.0, 10.0, 100.0)  # density of the box over that of sand
+HALF = (0.1, 0.1, 0.05)  # m
+DEPTH, GAP = 0.2, 0.05  # m
+WIDTH = {2: (0.8, 0.2), 3: (0.6, 0.6)}  # m, of the bed along x and y
+LAST = 0.25  # s at the end, over which rest is measured
+
+
+@cache
+def drop(dimension: int, dx: float, E: float = 3e6, phase: float = 0.0, gap: float = GAP) -> Bed:
+    """The box above its bed, whose surface lies `phase` cells above a plane of nodes."""
+    width, across = WIDTH[dimension]
+    top = DEPTH + phase * dx
+    high = np.ceil((top + gap + 2 * HALF[2] + 0.1) / dx) * dx
+    mjcf = f"""<worldbody><geom name="floor" type="plane" size="1 1 1" pos="{width / 2} {across / 2} 0"/>
+      <body pos="{width / 2} {across / 2} {top + gap + HALF[2]}"><freejoint/>
+      <geom name="box" type="box" size="{HALF[0]} {HALF[1]} {HALF[2]}" density="{RHO}"/></body></worldbody>"""
+    return Bed(
+        mjcf,
+        ("box",),
+        (width, across, float(high)),
+        (((0, 0, 0), (width, across, top)),),
+        dx,
+        dimension,
+        material=(("E", E),),
+    )
+
+
+class Drop(NamedTuple):
+    """What became of a drop."""
+
+    impact: float  # m/s
+    up: float  # m/s, fastest upward after the first touch
+    rms: float  # m/s, of the vertical speed over the last quarter of a second
+    weight: float  # mean force of sand and floor over the box's weight, at the end
+    from_sand: float  # mean force of the sand alone over the weight
+    rise: float  # largest rise of all energy in a rigid step, over that of the impact
+    rises: float  # sum of all rises in energy over that of the impact
+    depth: float  # cells, deepest grain inside the box
+    gap: float  # cells, from the bed's surface beside it at the start, to the box's underside at the end
+    trouble: list[str]
+
+
+def dropped(bed: Bed, ratio: float, seconds: float) -> tuple[Drop, np.ndarray]:
+    """Drop it; also its height (k,) m over the rigid steps."""
+    scene = bed.scene()
+    count = round(seconds / bed.rigid_dt)
+    last, steps = run(scene, lighter(bed.start(), ratio), count)
+    mass = scene.bodies.model.body_mass[1]
+    gap = scene.bodies.model.qpos0[2] - HALF[2] - bed.fills[0][1][2]
+    impact = np.sqrt(2 * G * gap)
+    speed, force, few = steps.qvel[:, 2], steps.reaction[:, 0, 2], round(LAST / bed.rigid_dt)
+    touched = int(np.argmax(force > 0.01 * mass * G))
+    energy = steps.grains + body_energy(scene, steps)
+    rises = np.diff(energy)
+    kick = 0.5 * mass * impact**2
+    total = mass * (np.diff(speed) / bed.rigid_dt + G)  # force on the box, whoever gave it
+    return Drop(
+        impact=float(impact),
+        up=float(speed[touched:].max()),
+        rms=float(np.sqrt(np.mean(speed[-few:] ** 2))),
+        weight=float(total[-few:].mean() / (mass * G)),
+        from_sand=float(force[-few:].mean() / (mass * G)),
+        rise=float(rises.max() / kick),
+        rises=float(np.maximum(rises, 0).sum() / kick),
+        depth=float(steps.contact.depth.max() / bed.dx),
+        gap=float((steps.qpos[-1, 2] - HALF[2] - bed.fills[0][1][2]) / bed.dx),
+        trouble=trouble(steps),
+    ), steps.qpos[:, 2]
