@@ -15,7 +15,7 @@ import numpy as np
 from jax import Array
 
 from coupling.constraints import Rows
-from coupling.contact import Points, Surface, distances, nearest_geom
+from coupling.contact import Points, Surface, depth_of, distances, nearest_geom
 from coupling.exchange import Exchange, Twists, exchange
 from coupling.geoms import Shape, bounding_radius, dot
 from mpm_env import native
@@ -29,7 +29,8 @@ class Geoms(NamedTuple):
     shapes: tuple[Shape, ...]
     body_of: tuple[int, ...]  # of each geom
     iterations: int  # of the exchange, at most
-    layer: float  # m, thickness of the layer of points that adhesion is shared among: a grid cell
+    layer: float  # m, a grid cell: what a layer of nodes stands for
+    dt: float  # s, in which a gap may close
     plane_strain: bool  # normals lie in the plane y = 0
     kernels: str  # "native" or "xla", as `native.chosen` says
 
@@ -64,6 +65,7 @@ class Surfaces(NamedTuple):
     mu: Array  # (G, M) friction of each geom
     hold: Array  # (M,) N s, the most that a layer of points at full weight is held back by: adhesion
     shares: Array | None  # (M, K) of the materials in each point; None where there is one material
+    full: Array | None = None  # (K,) kg, mass of a node with material all around it; None where points are all there is
 
 
 def meet(
@@ -74,6 +76,9 @@ def meet(
     Those with mass and nearer than `reach` to a geom take part in the exchange, see `exchange`; geoms stand at
     pos (G, 3) m with axes mat (G, 3, 3). Adhesion is shared among the points of one layer beneath the reach, so that
     those in line with each other add up to one at full weight.
+
+    A node has mass from 1.5 cells before the material's surface on, so by its share of the full mass it tells how far
+    away that surface is, see `depth_of`, and meets the body only when that gap would close within the substep.
     """
 
     def reference(
@@ -86,7 +91,10 @@ def meet(
         meets = (m > 0) & (phi < reach)
         shares = jnp.ones((1, 1), x.dtype) if s.shares is None else s.shares
         weight = jnp.maximum(1 - jnp.abs(phi - (reach - g.layer)) / g.layer, 0)
-        surface = Surface(dot(s.mu[geom].T, shares), weight * dot(s.hold, shares))
+        slack = 0.0
+        if s.full is not None:
+            slack = jnp.maximum(phi - g.layer * depth_of(m / s.full), 0) / g.dt
+        surface = Surface(dot(s.mu[geom].T, shares), weight * dot(s.hold, shares), slack)
         points = Points(x, v, jnp.where(meets, m, 0), phi, n, geom)
         done = exchange(points, t, q_free, surface, g.body_of, g.iterations)
         return Meeting(jnp.where(meets, phi, reach), jnp.where(meets, n, 0), done)
@@ -104,10 +112,12 @@ def meet(
             "plane_strain": g.plane_strain,
             "within": np.float64(reach),
             "layer": np.float64(g.layer),
+            "dt": np.float64(g.dt),
         }
         shares = jnp.zeros((0, 0), x.dtype) if s.shares is None else s.shares
         laws = jnp.stack([rows.D, rows.aim, rows.low, rows.high, rows.given])
-        arrays = (x, v, m, pos, mat, t.centre, t.J, t.d, t.M, s.mu, s.hold, shares, q_free, rows.J, rows.T, laws)
+        full = none if s.full is None else s.full
+        arrays = (x, v, m, pos, mat, t.centre, t.J, t.d, t.M, s.mu, s.hold, shares, full, q_free, rows.J, rows.T, laws)
         phi, n, q, impulse, wrench, residual, scale, given = call(*arrays, _voxels(g), **_table(g), **attributes)
         return Meeting(phi, n, Exchange(q, impulse, wrench, residual[0], scale[0], given))
 

@@ -74,6 +74,7 @@ class Contact(NamedTuple):
     nodes_over: Array  # () bool, more than fit
     grains_near: Array  # (P,) indices of grains, their number where a slot is free
     grains_over: Array  # () bool
+    full: Array  # (K,) kg, mass of each node with grains all around it
     shares: Array | None  # (M, K) of the materials in the nodes' mass; None where bodies treat all alike
 
     @classmethod
@@ -93,7 +94,7 @@ class Contact(NamedTuple):
         else:
             grains = (jnp.zeros((0,), jnp.int32), jnp.zeros((), bool))
         x = nodes.at[:, watched].get(mode="clip")
-        return cls(scene, stance, watched, x, over, *grains, _shares(scene, p, watched))
+        return cls(scene, stance, watched, x, over, *grains, _full(scene, p, watched), _shares(scene, p, watched))
 
     def start(self, q: Array) -> Touch:
         """Nothing has happened yet; joints move with q (nv,)."""
@@ -112,6 +113,7 @@ class Contact(NamedTuple):
         # A layer of nodes stands for a cell's width of surface each.
         area = self.scene.node_volume / self.scene.grid.cell_size
         surfaces = self._surfaces(self.shares, np.asarray(self.scene.adhesion) * area * self.scene.mpm_dt)
+        surfaces = surfaces._replace(full=self.full)
         touch, met = self._meet(touch, surfaces, free, self.nodes_x, lift(v.T), m, reach)
         return touch, self._flatten(met.exchange.impulse / jnp.where(m > 0, m, 1)).T
 
@@ -286,7 +288,19 @@ def _geoms(scene: Scene) -> Geoms:
     """The coupled geoms, and how contact with them is computed."""
     b, f = scene.bodies, scene.fidelity
     assert b is not None
-    return Geoms(b.shapes, b.body_of, f.contact_iterations, scene.grid.cell_size, scene.dimension == 2, scene.kernels)
+    dx, flat = scene.grid.cell_size, scene.dimension == 2
+    return Geoms(b.shapes, b.body_of, f.contact_iterations, dx, scene.mpm_dt, flat, scene.kernels)
+
+
+def _full(scene: Scene, p: Particles, watched: Array) -> Array:
+    """Masses (K,) kg of watched nodes with grains all around them, of the lightest at its density at rest.
+
+    Near the box's walls, all around is on their inner side only.
+    """
+    density = jnp.min(jnp.where(p.m > 0, p.m / p.V0, jnp.inf), initial=jnp.inf)
+    share = jnp.asarray(scene.grid.inner_shares().ravel(), p.m.dtype)
+    full = density * scene.node_volume * share.at[watched].get(mode="fill", fill_value=1)
+    return jnp.where(jnp.isfinite(full), full, 1)
 
 
 def _shares(scene: Scene, p: Particles, watched: Array) -> Array | None:

@@ -27,6 +27,8 @@ G = 9.81  # m/s^2
 RHO = 1500.0  # kg/m^3
 SAND = {"model": "sand", "E": 1e6, "nu": 0.3, "rho": RHO, "friction_deg": 35.0}
 
+STRIDE = 25  # rigid steps in one call
+
 Vec = tuple[float, float, float]
 
 
@@ -104,11 +106,27 @@ def _program(scene: Scene) -> Any:
 
 
 def run(scene: Scene, state: State, count: int, drives: Drive | None = None) -> tuple[State, Steps]:
-    """So many rigid steps by the scene's own motion, or by these drives."""
-    if drives is None:
-        drives = scripted(scene, int(state.steps), count)
-    last, steps = _program(scene)(state, drives)
-    return last, jax.tree.map(partial(np.asarray, dtype=np.float64), steps)
+    """So many rigid steps, up to STRIDE more, by the scene's own motion, or by these drives (count, ..)."""
+    parts, first = [], int(state.steps)
+    for k in range(0, count, STRIDE):  # in equal calls, so that a scene compiles once
+        some = (
+            scripted(scene, first + k, STRIDE)
+            if drives is None
+            else jax.tree.map(lambda a, k=k: a[k : k + STRIDE], drives)
+        )
+        state, steps = _program(scene)(state, some)
+        parts.append(jax.tree.map(partial(np.asarray, dtype=np.float64), steps))
+    return state, jax.tree.map(lambda *a: np.concatenate(a), *parts)
+
+
+def settled(scene: Scene, state: State, rounds: int = 4) -> State:
+    """The state with its grains come to rest, by taking all speed out of them now and then; bodies stay where they are."""
+    there = state.rigid
+    for _ in range(rounds):
+        state, _ = run(scene, state, STRIDE)
+        still = replace(state.grains, v=0 * state.grains.v, C=0 * state.grains.C)
+        state = replace(state, grains=still, rigid=there)
+    return replace(state, steps=0 * state.steps)
 
 
 def lighter(state: State, ratio: float, **material: float) -> State:
@@ -119,7 +137,9 @@ def lighter(state: State, ratio: float, **material: float) -> State:
     return replace(state, materials=(sand,), grains=replace(state.grains, m=state.grains.m / ratio))
 
 
-def shifted(scene: Scene, state: State, qpos: Sequence[float] | None = None, qvel: Sequence[float] | None = None) -> State:
+def shifted(
+    scene: Scene, state: State, qpos: Sequence[float] | None = None, qvel: Sequence[float] | None = None
+) -> State:
     """The state with bodies elsewhere, or moving."""
     d, dtype = state.rigid, state.rigid.qpos.dtype
     if qpos is not None:

@@ -83,6 +83,17 @@ class Grid:
         """Number of nodes."""
         return int(np.prod(self.shape))
 
+    def inner_shares(self) -> np.ndarray:
+        """Share (*shape) of each node's window that lies inside the box, of a node beyond the first layer outside, 1."""
+        shares = []
+        for n, cells in zip(self.shape, self.cells, strict=True):
+            inside = np.minimum(np.arange(n) - MARGIN, MARGIN + cells - np.arange(n))  # cells from the nearer wall
+            shares.append(np.select([inside == 0, inside == -1, inside == 1], [1 / 2, 1 / 48, 47 / 48], 1.0))
+        out = shares[0]
+        for more in shares[1:]:
+            out = out[..., None] * more
+        return out
+
     def node_positions(self) -> np.ndarray:
         """(N, d) m: node positions from the grid's origin, in the order of the flattened grid."""
         axes = [np.arange(n) * self.cell_size for n in self.shape]

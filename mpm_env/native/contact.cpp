@@ -7,7 +7,7 @@
 namespace MPM_ISA {
 namespace {
 
-constexpr double LEAST_NORMAL = 1e-6;  // that of meeting.py
+constexpr double LEAST_NORMAL = 1e-6, LEAST_FILL = 1e-6;  // those of meeting.py and contact.py
 
 // Rows (3, count) from point i on, a pack; beyond the last point, that one again.
 template <class S> INLINE void load(const S* a, int64_t count, int64_t i, Rows<S>& x) {
@@ -34,6 +34,16 @@ template <class S, class L, class F> INLINE void walk(const std::vector<Geom<S>>
     if (some.empty()) continue;
     for (int k = 0; k < packs; ++k) visit(i + k * W, std::min<int64_t>(W, end - i - k * W), at[k], some);
   }
+}
+
+// How deep in cells a node lies in a half space of material that gives it this share of its full mass.
+template <class S> inline S depth_of(S fill) {
+  const S most = std::max(std::min(fill, S(1 - LEAST_FILL)), S(LEAST_FILL));
+  if (most < S(1.0 / 6)) return std::cbrt(6 * most) - S(1.5);
+  if (most > S(5.0 / 6)) return S(1.5) - std::cbrt(6 * (1 - most));
+  S s = S(1.4) * (most - S(0.5));
+  for (int i = 0; i < 2; ++i) s -= (S(0.75) * s - s * s * s / 3 - (most - S(0.5))) / (S(0.75) - s * s);
+  return s;
 }
 
 template <class S> void run(const Near& t, int64_t b) {
@@ -131,6 +141,8 @@ template <class S> void run(const Meet& t, int64_t b) {
     }
     mine[FRICTION * W] = friction;
     mine[HOLD * W] = hold;
+    const S gap = t.gaps ? phi[i] - S(t.layer) * depth_of(m[i] / t.full.of<S>(b)[i]) : S(0);
+    mine[SLACK * W] = std::max(gap, S(0)) / S(t.dt);
   }
 
   Constraints rows{int(t.rows), int(nv)};

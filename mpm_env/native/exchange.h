@@ -22,7 +22,7 @@ template <class S> INLINE double total(const Pack<S>& a) {
   return (sum[0] + sum[1]) + (sum[2] + sum[3]);
 }
 
-enum CrowdRow { NORMAL = 0, SPEED = 3, MASS = 6, FRICTION = 7, HOLD = 8, LEVER = 9 };
+enum CrowdRow { NORMAL = 0, SPEED = 3, MASS = 6, FRICTION = 7, HOLD = 8, SLACK = 9, LEVER = 10 };
 
 // Points against bodies, packed: sixteen at a time, the last ones without mass.
 template <class S> struct Crowd {
@@ -36,7 +36,7 @@ template <class S> struct Crowd {
 // The inelastic contact with Coulomb friction and adhesion: impulses f on points that move with w relative to their bodies.
 template <class S> INLINE void impulses(const Pack<S>* p, const Rows<S>& w, Rows<S>& f) {
   const Pack<S>*n = p + NORMAL, m = p[MASS], hold = p[HOLD];
-  Pack<S> approach = -(w[0] * n[0] + w[1] * n[1] + w[2] * n[2]), normal = largest(m * approach, -hold);
+  Pack<S> approach = -(w[0] * n[0] + w[1] * n[1] + w[2] * n[2]), normal = largest(m * (approach - p[SLACK]), -hold);
   Rows<S> slide;
   for (int i = 0; i < 3; ++i) slide[i] = w[i] + approach * n[i];
   Pack<S> held = p[FRICTION] * (normal + hold) / root(dot<S>(slide, slide) + S(TINY));
@@ -49,12 +49,12 @@ template <class S> INLINE void impulses(const Pack<S>* p, const Rows<S>& w, Rows
 template <class S> INLINE void stiffness(const Pack<S>* p, const Rows<S>& w, Pack<S> D[3][3]) {
   const Pack<S> zero(S(0)), one(S(1));
   const Pack<S>*n = p + NORMAL, hold = p[HOLD];
-  Pack<S> approach = -(w[0] * n[0] + w[1] * n[1] + w[2] * n[2]), normal = largest(p[MASS] * approach, -hold);
+  Pack<S> approach = -(w[0] * n[0] + w[1] * n[1] + w[2] * n[2]), normal = largest(p[MASS] * (approach - p[SLACK]), -hold);
   Rows<S> t;
   for (int i = 0; i < 3; ++i) t[i] = w[i] + approach * n[i];
   Pack<S> speed = root(dot<S>(t, t) + S(TINY)), rub = p[FRICTION] * (normal + hold) / speed;
   for (int i = 0; i < 3; ++i) t[i] = t[i] / speed;
-  Pack<S> m = select<S>(p[MASS] * approach > -hold, p[MASS], zero);
+  Pack<S> m = select<S>(p[MASS] * (approach - p[SLACK]) > -hold, p[MASS], zero);
   Bits<S> sticks = rub >= p[MASS];
   for (int i = 0; i < 3; ++i)
     for (int j = 0; j < 3; ++j) {

@@ -132,14 +132,14 @@ ffi::Error near(ffi::AnyBuffer x, ffi::AnyBuffer high, ffi::AnyBuffer pos, ffi::
 
 ffi::Error meet(ffi::AnyBuffer x, ffi::AnyBuffer v, ffi::AnyBuffer m, ffi::AnyBuffer pos, ffi::AnyBuffer mat,
                 ffi::AnyBuffer centre, ffi::AnyBuffer J, ffi::AnyBuffer d, ffi::AnyBuffer M, ffi::AnyBuffer mu,
-                ffi::AnyBuffer hold, ffi::AnyBuffer shares, ffi::AnyBuffer q_free, ffi::AnyBuffer rows_J,
+                ffi::AnyBuffer hold, ffi::AnyBuffer shares, ffi::AnyBuffer full, ffi::AnyBuffer q_free, ffi::AnyBuffer rows_J,
                 ffi::AnyBuffer rows_T, ffi::AnyBuffer rows_law, ffi::AnyBuffer voxels, ffi::Result<ffi::AnyBuffer> phi,
                 ffi::Result<ffi::AnyBuffer> n, ffi::Result<ffi::AnyBuffer> q, ffi::Result<ffi::AnyBuffer> impulse,
                 ffi::Result<ffi::AnyBuffer> wrench, ffi::Result<ffi::AnyBuffer> residual,
                 ffi::Result<ffi::AnyBuffer> scale, ffi::Result<ffi::AnyBuffer> given, Ints kind, Ints first, Ints nodes, Floats size, Floats reach,
                 Floats origin, Floats spacing, Ints body_of, int64_t iterations, bool plane_strain, double within,
-                double layer) {
-  if (!alike(x, v, m, pos, mat, centre, J, d, M, mu, hold, shares, q_free, rows_J, rows_T, rows_law) ||
+                double layer, double dt) {
+  if (!alike(x, v, m, pos, mat, centre, J, d, M, mu, hold, shares, full, q_free, rows_J, rows_T, rows_law) ||
       voxels.element_type() != ffi::F32)
     return MIXED();
   const auto all = phi->dimensions();
@@ -156,10 +156,12 @@ ffi::Error meet(ffi::AnyBuffer x, ffi::AnyBuffer v, ffi::AnyBuffer m, ffi::AnyBu
   t.plane_strain = plane_strain;
   t.reach = within;
   t.layer = layer;
+  t.dt = dt;
+  t.gaps = full.dimensions().back() > 0;
   t.x = shared(x, 2, all); t.v = shared(v, 2, all); t.m = shared(m, 1, all);
   t.pos = shared(pos, 2, all); t.mat = shared(mat, 3, all); t.centre = shared(centre, 2, all);
   t.J = shared(J, 3, all); t.d = shared(d, 2, all); t.M = shared(M, 2, all); t.q_free = shared(q_free, 1, all);
-  t.mu = shared(mu, 2, all); t.hold = shared(hold, 1, all); t.shares = shared(shares, 2, all);
+  t.mu = shared(mu, 2, all); t.hold = shared(hold, 1, all); t.shares = shared(shares, 2, all); t.full = shared(full, 1, all);
   t.rows_J = shared(rows_J, 2, all); t.rows_T = shared(rows_T, 2, all); t.rows_law = shared(rows_law, 2, all);
   t.phi = phi->untyped_data(); t.n = n->untyped_data(); t.q = q->untyped_data();
   t.impulse = impulse->untyped_data(); t.wrench = wrench->untyped_data(); t.given = given->untyped_data();
@@ -186,11 +188,11 @@ XLA_FFI_DEFINE_HANDLER_SYMBOL(mpm_env_to_grains, to_grains,
 XLA_FFI_DEFINE_HANDLER_SYMBOL(mpm_env_near, near,
                               ffi::Ffi::Bind().ARG.ARG.ARG.ARG.ARG.RET.RET GEOM_ATTRIBUTES.Attr<double>("low"));
 XLA_FFI_DEFINE_HANDLER_SYMBOL(mpm_env_meet, meet,
-                              ffi::Ffi::Bind().ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG
+                              ffi::Ffi::Bind().ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG.ARG
                                   .RET.RET.RET.RET.RET.RET.RET.RET
                                   GEOM_ATTRIBUTES.Attr<Ints>("body_of").Attr<int64_t>("iterations")
                                   .Attr<bool>("plane_strain").Attr<double>("within")
-                                  .Attr<double>("layer"));
+                                  .Attr<double>("layer").Attr<double>("dt"));
 
 // Read through ctypes before anything is registered.
 extern "C" {

@@ -72,9 +72,10 @@ struct Meet {
   GeomTable geoms;
   const int64_t* body_of;
   int64_t batch, points, bodies, nv, materials, rows, iterations;
+  bool gaps;          // whether `full` is given: nodes, which tell how far away their material is
   bool plane_strain;  // normals lie in the plane y = 0
-  double reach, layer;
-  Shared x, v, m, pos, mat, centre, J, d, M, mu, hold, shares, q_free, rows_J, rows_T, rows_law;
+  double reach, layer, dt;
+  Shared x, v, m, pos, mat, centre, J, d, M, mu, hold, shares, full, q_free, rows_J, rows_T, rows_law;
   void *phi, *n, *q, *impulse, *wrench, *residual, *scale, *given;
 };
 

@@ -31,12 +31,13 @@ class Case(NamedTuple):
     m: Any  # (K,) kg
     hold: Any = np.zeros(())  # () or (M,) N s
     shares: Any = None  # (M, K)
+    full: Any = None  # (K,) kg
 
 
 def encounter(g: Geoms, case: Case, reach: float) -> Meeting:
     """The points of a case meet its bodies."""
     mu, hold = case.mu.reshape(len(g.shapes), -1), jnp.atleast_1d(jnp.asarray(case.hold, case.x.dtype))
-    surfaces = Surfaces(mu, hold, case.shares)
+    surfaces = Surfaces(mu, hold, case.shares, case.full)
     return meet(g, case.pos, case.mat, case.t, surfaces, case.q_free, case.x, case.v, case.m, reach)
 
 
@@ -73,6 +74,7 @@ TIPS = {
     "mesh": (-0.14, 0, 0),
 }  # m, where geoms that end reach farthest from their middle
 LAYER = 0.05  # m, that adhesion is shared in
+DT = 0.01  # s, in which gaps may close
 EACH = 125  # points around each geom: no multiple of 16, nor is eight times it
 PITCH = 1.5  # m between geoms that stand apart
 FAR = 10.0  # m, a reach that all points are within
@@ -102,7 +104,7 @@ def shapes() -> tuple[Shape, ...]:
 @cache
 def geoms(kernels: str, plane_strain: bool = False) -> Geoms:
     """All of them on one body without joints."""
-    return Geoms(shapes(), tuple(0 for _ in KINDS), 0, LAYER, plane_strain, kernels)
+    return Geoms(shapes(), tuple(0 for _ in KINDS), 0, LAYER, DT, plane_strain, kernels)
 
 
 @cache
@@ -160,7 +162,7 @@ def alone(geom: int, x: np.ndarray, turn: np.ndarray | None = None) -> tuple[Geo
     """One of the geoms in the middle, turned or not, among points x (3, N) m, for `near`."""
     mat = (np.eye(3) if turn is None else turn)[None]
     case = around("apart")._replace(pos=np.zeros((1, 3)), mat=mat, x=x)
-    return Geoms((shapes()[geom],), (0,), 0, LAYER, False, "native"), case
+    return Geoms((shapes()[geom],), (0,), 0, LAYER, DT, False, "native"), case
 
 
 def listed(phi: np.ndarray, low: float, high: np.ndarray, room: int) -> np.ndarray:
@@ -222,7 +224,7 @@ def crowd(kernels: str, iterations: int = 6) -> Geoms:
     """Three balls and three boxes on three bodies."""
     ball, box = Shape(2, (RADIUS, 0, 0)), Shape(6, tuple(HALF))
     return Geoms(
-        tuple(ball if g in BALLS else box for g in range(len(BODY_OF))), BODY_OF, iterations, LAYER, False, kernels
+        tuple(ball if g in BALLS else box for g in range(len(BODY_OF))), BODY_OF, iterations, LAYER, DT, False, kernels
     )
 
 
@@ -335,6 +337,16 @@ def sticky(dtype: str) -> Case:
     return in_precision(case._replace(mu=mu, hold=hold, shares=np.concatenate([share, 1 - share], axis=1)), dtype)
 
 
+@cache
+def gapped(dtype: str) -> Case:
+    """The free body before nodes of which some have little of the material that could be around them."""
+    case, rng = encounters(6).case, np.random.default_rng(9)
+    fill = np.where(
+        rng.random(case.m.shape) < 0.5, rng.uniform(0, 1.2, case.m.shape), rng.uniform(0, 0.2, case.m.shape)
+    )
+    return in_precision(case._replace(full=np.where(case.m > 0, case.m / np.maximum(fill, 1e-3), 1)), dtype)
+
+
 def sliding(nv: int) -> tuple[Geoms, Case]:
     """Points that all slide over a ball, none near a kink of the law."""
     rng = np.random.default_rng(5)
@@ -344,7 +356,7 @@ def sliding(nv: int) -> tuple[Geoms, Case]:
     t = Twists(np.zeros((1, 3)), 0.3 * rng.normal(size=(1, 6, nv)), 0.1 * rng.normal(size=(1, 6)), 3 * np.eye(nv))
     q = rng.normal(scale=0.2, size=nv)
     case = Case(np.zeros((1, 3)), np.eye(3)[None], t, np.full(1, 0.3), q, 0.11 * n.T, v.T, rng.uniform(0.1, 1, 9))
-    return Geoms((Shape(2, (RADIUS, 0, 0)),), (0,), 3, LAYER, False, "native"), case
+    return Geoms((Shape(2, (RADIUS, 0, 0)),), (0,), 3, LAYER, DT, False, "native"), case
 
 
 @cache

@@ -301,6 +301,19 @@ def test_what_is_little_beside_a_fast_common_motion_is_rounding() -> None:
         assert np.median(done.residual > 0) == told and np.any(done.scale < 1) == told
 
 
+# Gaps that close first.
+
+
+@each_precision
+def test_nodes_with_little_material_meet_bodies_as_in_the_reference(dtype: str) -> None:
+    case = enc.gapped(dtype)
+    got, truth = (met(enc.crowd(k), case, REACH, d, "batch") for k, d in (("native", dtype), ("xla", "float64")))
+    assert_same(got, truth, case, dtype)
+    never = enc.answers(dtype)[JOINTS.index(6)].exchange.impulse
+    fewer = np.any(got.exchange.impulse, axis=1).sum() / np.any(never, axis=1).sum()
+    assert 0.2 < fewer < 0.9, "gaps make no difference"
+
+
 # Rigid constraints in the exchange.
 
 
