@@ -9,12 +9,7 @@ To add a primitive: write its distance, then add one line to `GEOM_SDF` and one 
 """
 
 import functools
-import hashlib
 import math
-import os
-import tempfile
-import warnings
-import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +22,8 @@ import numpy as np
 from jax import Array
 from jax.scipy.ndimage import map_coordinates
 
+from coupling.voxels import Voxels, voxels_of
+
 MESH = int(mujoco.mjtGeom.mjGEOM_MESH)
 
 TINY_SQUARE = 1e-30
@@ -38,24 +35,11 @@ HALVINGS = 10
 """Brackets up to e^32 wide (`NUDGE`, and points 1e5 half axes away) shrink to e^(32 / 2^10) = 1.03."""
 NEWTON_STEPS = 4
 """From 3 % off, an error e becomes 1.5 e^2 each step: 1e-3, 3e-6, 1e-11, below float64's digits."""
-MARGIN = 2
-"""Voxels between a mesh and the edge of its grid, so that gradients just outside are sampled, not clamped."""
-CELLS = (8, 256)
-"""Fewest and most voxels along a grid: below, the margin eats it; above, it takes over 64 MB."""
 FLAT_GRADIENT = 1e-6
 """A squared gradient below this has no direction left: exact distances have 1, voxels 0 on ridges inside."""
 
 
 Rows = Array | Sequence[Array]
-
-
-@dataclass(frozen=True, eq=False)
-class Voxels:
-    """Signed distances to a mesh at the nodes of a grid of cubes, in the geom's frame."""
-
-    values: np.ndarray  # (nx, ny, nz) m, float32
-    origin: np.ndarray  # (3,) m, place of values[0, 0, 0]
-    spacing: float  # m
 
 
 @dataclass(frozen=True, eq=False)
@@ -261,8 +245,7 @@ def shape_of(model: mujoco.MjModel, geom: int, *, cells: int = 64, cache_dir: Pa
     Meshes take about half a second at 64 cells, once: distances are kept in `cache_dir`, by default
     `mpm_env/sdf` in `$XDG_CACHE_HOME` or `~/.cache`.
 
-    Raises ValueError for an unknown geom, a geom type without a distance, a mesh that encloses no voxel node,
-    and `cells` outside `CELLS`.
+    Raises ValueError for an unknown geom, a geom type without a distance, and what `voxels_of` refuses of a mesh.
     """
     if not 0 <= geom < model.ngeom:
         raise ValueError(f"geom = {geom} is not in this model: use an id in 0..{model.ngeom - 1}.")
@@ -277,82 +260,8 @@ def shape_of(model: mujoco.MjModel, geom: int, *, cells: int = 64, cache_dir: Pa
             f"geom {name} is of type {_type_name(kind)}, which cannot touch grains; "
             f"supported are {supported}: replace it by those or leave it out of the coupling."
         )
-    return Shape(kind, (a, b, c), _voxels_of(model, geom, name, cells, cache_dir or user_cache("sdf")))
+    return Shape(kind, (a, b, c), voxels_of(model, geom, cells=cells, cache_dir=cache_dir))
 
 
 def _type_name(kind: int) -> str:
     return mujoco.mjtGeom(kind).name.removeprefix("mjGEOM_").lower()
-
-
-def user_cache(name: str) -> Path:
-    """The folder `mpm_env/name` in `$XDG_CACHE_HOME` or `~/.cache`, there or not; RuntimeError if there is no home."""
-    # An empty XDG_CACHE_HOME counts as not set (XDG Base Directory Specification).
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mpm_env" / name
-
-
-def _voxels_of(model: mujoco.MjModel, geom: int, name: str, cells: int, cache_dir: Path) -> Voxels:
-    """The voxels of a mesh geom: read from the cache, else computed and kept."""
-    if not CELLS[0] <= cells <= CELLS[1]:
-        raise ValueError(f"cells = {cells} for the mesh of geom {name} is outside {CELLS[0]}..{CELLS[1]}.")
-    data = int(model.geom_dataid[geom])
-    if data < 0 or model.mesh_facenum[data] == 0:
-        raise ValueError(f"geom {name} has a mesh without faces: give it faces, or use a primitive geom.")
-    first, count = model.mesh_vertadr[data], model.mesh_vertnum[data]
-    vertices = np.asarray(model.mesh_vert[first : first + count], np.float64)
-    first, count = model.mesh_faceadr[data], model.mesh_facenum[data]
-    faces = np.asarray(model.mesh_face[first : first + count], np.int64)
-
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
-    spacing = float((high - low).max()) / (cells - 2 * MARGIN)
-    nodes = np.ceil((high - low) / spacing).astype(int) + 2 * MARGIN + 1
-    origin = (low + high - spacing * (nodes - 1)) / 2
-
-    recipe = repr((vertices.shape, faces.shape, cells, MARGIN)).encode()
-    digest = hashlib.sha256(recipe + vertices.tobytes() + faces.tobytes()).hexdigest()
-    file = cache_dir / f"{digest}.npz"
-    values = _read(file, tuple(nodes))
-    if values is None:
-        places = origin + spacing * np.stack(np.meshgrid(*map(np.arange, nodes), indexing="ij"), axis=-1)
-        values = _mesh_distances(places.reshape(-1, 3), vertices, faces).reshape(nodes)
-        _write(file, values)
-    if not (values < 0).any():
-        raise ValueError(
-            f"the mesh of geom {name} encloses none of its voxels of {spacing:.3g} m: it must be closed, "
-            f"with faces turned outward and walls of two voxels; use cells > {cells}, or build it from boxes."
-        )
-    return Voxels(values, origin, spacing)
-
-
-def _mesh_distances(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Signed distances (n,) m, float32, of points (n, 3) m to a mesh, negative where it winds around.
-
-    Winding numbers get the sign right for concave meshes, and at edges (libigl; Barill et al. 2018, Fast
-    Winding Numbers for Soups and Clouds).
-    """
-    import igl  # a compiled library that only scenes with meshes need
-
-    winding = igl.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER
-    signed, _, nearest, _ = igl.signed_distance(points, vertices, faces, winding)
-    # Only its sign is good: libigl multiplies the distance by 1 - 2 w, w the approximate winding number.
-    return np.copysign(np.linalg.norm(points - nearest, axis=1), signed).astype(np.float32)
-
-
-def _read(file: Path, shape: tuple[int, ...]) -> np.ndarray | None:
-    """Kept distances, or None where there are none or the file is damaged (npz files hold a checksum)."""
-    try:
-        with file.open("rb") as opened, np.load(opened) as kept:
-            values = kept["values"]
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
-        return None
-    return values if values.shape == shape and values.dtype == np.float32 else None
-
-
-def _write(file: Path, values: np.ndarray) -> None:
-    """Keep distances for next time, whole or not at all: another process may use the same file now."""
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=file.parent) as private:
-            np.savez(Path(private) / file.name, values=values)
-            os.replace(Path(private) / file.name, file)
-    except OSError as error:
-        warnings.warn(f"mesh distances cannot be kept and are computed each time: {error}", stacklevel=2)

@@ -11,7 +11,7 @@ from typing import Any
 
 import jax
 
-from coupling.geoms import user_cache
+from coupling.voxels import user_cache
 
 LEAST_COMPILE_TIME = 0.05  # s: what takes less is compiled as fast as it is found in the folder
 

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from coupling import geoms
+from coupling import geoms, voxels
 from coupling.contact import nearest_geom
-from coupling.geoms import BOUNDS, GEOM_SDF, Shape, Voxels
+from coupling.geoms import BOUNDS, GEOM_SDF, Shape
+from coupling.voxels import Voxels
 
 SIZE = (0.3, 0.15, 0.1)  # m; each primitive reads from it what it needs
 PLANE, ELLIPSOID, BOX = (int(getattr(mujoco.mjtGeom, f"mjGEOM_{t}")) for t in ("PLANE", "ELLIPSOID", "BOX"))
@@ -301,7 +302,7 @@ def test_kept_voxels_are_used_again(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     first = geoms.shape_of(model, 0, cells=16)
     assert [f.suffix for f in (tmp_path / "mpm_env" / "sdf").iterdir()] == [".npz"]
-    monkeypatch.setattr(geoms, "_mesh_distances", None)  # would raise if called
+    monkeypatch.setattr(voxels, "_mesh_distances", None)  # would raise if called
     second = geoms.shape_of(model, 0, cells=16)
     np.testing.assert_array_equal(voxels_of(first).values, voxels_of(second).values)
 
@@ -361,10 +362,10 @@ def test_mesh_without_faces_is_refused(tmp_path: Path) -> None:
         geoms.shape_of(model, 0, cache_dir=tmp_path)
 
 
-def test_mesh_that_encloses_nothing_is_refused(tmp_path: Path) -> None:
+def test_a_sheet_is_refused(tmp_path: Path) -> None:
     corners = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0.1)]
     sheet = mesh_model(corners, [(0, 1, 2), (2, 1, 3)], inertia="shell")
-    with pytest.raises(ValueError, match=r"mesh of geom tool encloses none of its voxels .* cells > 16"):
+    with pytest.raises(ValueError, match=r"mesh of geom tool has a hole, .* near \(.*\) m .*: mend it, or"):
         geoms.shape_of(sheet, 0, cells=16, cache_dir=tmp_path)
 
 
