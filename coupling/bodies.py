@@ -323,18 +323,27 @@ def _integrated_mass(b: Bodies, d: Any) -> Array:
     return M + dt * jnp.diag(model.dof_damping)
 
 
-def close_step(b: Bodies, d: Any, impulse: Array) -> Any:
+def close_step(b: Bodies, d: Any, impulse: Array, foreseen: Array | None = None) -> Any:
     """Integrate one rigid step with the grains' summed generalised impulse (nv,) N s, N m s.
 
     With the same matrix and constraints as in the exchange, the joint velocities come out as the exchange left them.
+    MJX's constraint solver starts from the acceleration `foreseen` (nv,), see there, and then has little left to do:
+    stiff constraints of light bodies under much sand are more than it can do in f32 by itself.
     """
     if not b.steps:
         return d.replace(time=d.time + b.model.opt.timestep)
     model = b.mjx_model
+    if foreseen is not None:
+        d = d.replace(qacc_warmstart=foreseen)
     d = mjx.fwd_acceleration(model, d.replace(qfrc_applied=impulse / b.model.opt.timestep))
     d = mjx.sensor_acc(model, _constrained(model, d))
     step = mjx.implicit if model.opt.integrator == IntegratorType.IMPLICITFAST else mjx.euler
     return step(model, d)
+
+
+def foreseen(b: Bodies, s: Stance, q: Array) -> Array:
+    """The joint acceleration (nv,) over a rigid step that ends with q (nv,), as the constraints see it."""
+    return s.laws.T @ (q - s.q) / b.model.opt.timestep
 
 
 def twists(s: Stance, centre_now: Array, time: Array, given: Array) -> Twists:

@@ -79,14 +79,14 @@ class Settled(NamedTuple):
     left: Array  # () share of the equation left unsolved
 
 
-def settled(M: Array, r: Rows, q: Array, load: Array, guess: Array) -> Settled:
+def settled(M: Array, r: Rows, q: Array, load: Array, guess: Array, metric: Array | None = None) -> Settled:
     """The change c of joint velocities q (nv,) for which M c = load + J^T (p(q + c) - given), from a guess of it.
 
     load (nv,): generalised impulse besides the constraints'; M (nv, nv): what the integrator solves. In T c this is the
     minimum of a convex function, MuJoCo's. A Newton iteration, whose steps end where that function is least along them,
-    if they would go beyond.
+    if they would go beyond. What remains is measured in the metric, by default the inverse of M.
     """
-    metric = jnp.linalg.inv(M)
+    metric = jnp.linalg.inv(M) if metric is None else metric
 
     def size(R: Array) -> Array:
         return jnp.sqrt(jnp.maximum(R @ metric @ R, 0))

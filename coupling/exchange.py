@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from coupling.constraints import SOLVED, STEPS, Rows, firm_mass, pushes, settled, slope
+from coupling.constraints import SOLVED, STEPS, Rows, firm_mass, pushes, settled
 from coupling.contact import Points, Surface, cross, impulses, stiffness
 from coupling.geoms import dot, once
 
@@ -101,20 +101,39 @@ def exchange(
     def nearer(old: Newton, step: Array, shares: Array) -> Newton:
         """After the best of some shares (n,) of a step (nv,), if it helps at all."""
         w = old.w[:, None] - shares[:, None] * once(moved(step))[:, None]
-        new = best(old.change + shares[:, None] * step, w)
+        return better(old, best(old.change + shares[:, None] * step, w))
+
+    def better(old: Newton, new: Newton) -> Newton:
         helps = new.size < old.size
         new = jax.tree.map(lambda a, b: jnp.where(helps, a, b), new, old)
         return new._replace(going=helps & (new.size > enough))
 
     def newton(_: int, at: Newton) -> Newton:
         D = stiffness(p, at.w, surface)
-        H = t.M + pull(jnp.stack([dot(row[:, None], lever) for row in D])).T
-        if rows:
-            H += slope(rows, q_held + at.change)
-        return nearer(at, -jnp.linalg.solve(H, at.R), jnp.asarray(STEPS, at.R.dtype))
+        K = pull(jnp.stack([dot(row[:, None], lever) for row in D])).T
+        if not rows:
+            return nearer(at, -jnp.linalg.solve(t.M + K, at.R), jnp.asarray(STEPS, at.R.dtype))
+        pulled = pull(impulses(p, at.w, surface)[:, None])[0]
+        return better(at, among([held_step(at.change, K, pulled, share) for share in STEPS]))
 
-    stuck = metric @ pull((p.m * w_free)[:, None])[0]
-    at = nearer(none, stuck, jnp.ones((1,), stuck.dtype))
+    def held_step(x: Array, K: Array, pulled: Array, share: float) -> Array:
+        """The change (nv,) of q by a Newton step from x for the points, that the constraints take to the full.
+
+        Their kinks would stop a line search; so shorter steps are not shares of it, but steps of heavier points.
+        """
+        A = K + (1 / share - 1) * stuck_mass
+        return settled(t.M + A, rows._replace(given=held.given), q_held, A @ x - pulled, x, metric).change
+
+    def among(changes: list[Array]) -> Newton:
+        some = jnp.stack(changes)
+        return best(some, w_free[:, None] - dot(some.T[..., None], [lever[:, None, j] for j in range(nv)]))
+
+    all_stick = pull((p.m * w_free)[:, None])[0]
+    if rows:
+        points = pull(p.m * lever)
+        at = better(none, among([held_step(zero, points, -all_stick, 1.0)]))
+    else:
+        at = nearer(none, metric @ all_stick, jnp.ones((1,), all_stick.dtype))
     at = at._replace(going=at.size > enough)
     at = jax.lax.fori_loop(0, iterations, lambda i, at: jax.lax.cond(at.going, newton, lambda _, at: at, i, at), at)
     f = impulses(p, at.w, surface)

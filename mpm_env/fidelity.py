@@ -29,7 +29,7 @@ class Fidelity(Section):
     kernels: Literal["auto", "native", "xla"] = Field(
         "auto", description="native C++ where it can be had, or plain XLA: the same to rounding, far apart in speed"
     )
-    contact_band: Annotated[float, Field(ge=0, le=1)] = Field(0.5, description="cells off a body where nodes feel it")
+    contact_band: Annotated[float, Field(ge=0, le=1)] = Field(0.25, description="cells off a body where nodes feel it")
     contact_iterations: int = Field(4, ge=1, le=20, description="Newton iterations of the momentum exchange")
     two_way: bool = Field(
         True, description="grains push bodies; if not, bodies go as if there were none, and nothing is solved"

@@ -70,7 +70,9 @@ def rigid_step(scene: Scene, state: State, drive: Drive) -> State:
     contact = Contact.of(scene, jax.tree.map(lambda a: a.astype(scene.dtype), stance), state.grains)
     touch = contact.start(d.qvel.astype(scene.dtype))
     grains, touch = _run_grains(scene, state, contact, touch)
-    d = rigid.close_step(b, d, touch.impulse.astype(d.qvel.dtype))
+    dtype = d.qvel.dtype
+    foreseen = rigid.foreseen(b, stance, touch.q.astype(dtype)) if b.steps else None
+    d = rigid.close_step(b, d, touch.impulse.astype(dtype), foreseen)
     d = rigid.refresh(b, rigid.place(d, drive.position, drive.quaternion))
     report = contact.report(touch, d.qvel.astype(scene.dtype))
     after = replace(

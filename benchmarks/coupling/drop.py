@@ -38,7 +38,7 @@ def drop(dimension: int, dx: float, E: float = 3e6, phase: float = 0.0, gap: flo
         (((0, 0, 0), (width, across, top)),),
         dx,
         dimension,
-        material=(("E", E),),
+        material={"E": E},
     )
 
 

@@ -7,7 +7,7 @@ compiled scene serves all density ratios, see `lighter`.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from typing import Any, NamedTuple
 
@@ -32,9 +32,12 @@ STRIDE = 25  # rigid steps in one call
 Vec = tuple[float, float, float]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Bed:
-    """A box with walls, some of it full of sand, and a model in it. Lengths in m; plane strain if dimension is 2."""
+    """A box with walls, some of it full of sand, and a model in it. Lengths in m; plane strain if dimension is 2.
+
+    Equal only to itself, so that what is built and compiled for it is kept.
+    """
 
     mjcf: str  # what stands inside <mujoco>
     couple: tuple[str, ...]
@@ -45,10 +48,9 @@ class Bed:
     friction: float = 0.5  # of bodies
     gravity: float = G
     rigid_dt: float = 0.004
-    material: tuple[tuple[str, Any], ...] = ()  # what differs from SAND
-    walls: tuple[tuple[str, str, float], ...] = (("z_lower", "separate", 0.5),)  # side, kind, friction
-    fidelity: tuple[tuple[str, Any], ...] = ()  # what differs from the default
-    bodies: tuple[tuple[str, Any], ...] = ()  # more of BodiesConfig
+    material: dict[str, Any] = field(default_factory=dict)  # what differs from SAND
+    fidelity: dict[str, Any] = field(default_factory=dict)  # what differs from the default
+    bodies: dict[str, Any] = field(default_factory=dict)  # more of BodiesConfig
 
     @cache
     def scene(self) -> Scene:
@@ -60,17 +62,17 @@ class Bed:
             "feature": cells * self.dx,
             "gravity": (0, 0, -self.gravity),
             "duration": 1.0,
-            "walls": {side: {"kind": kind, "friction": mu} for side, kind, mu in self.walls},
+            "walls": {"z_lower": {"kind": "separate", "friction": 0.5}},
             "grains": [
                 {
-                    "material": SAND | dict(self.material),
+                    "material": SAND | self.material,
                     "fill": [{"shape": "box", "lower": low, "upper": high} for low, high in self.fills],
                 }
             ],
             "bodies": {"mjcf": f"<mujoco>{self.mjcf}</mujoco>", "couple": list(self.couple), "friction": self.friction}
-            | dict(self.bodies),
+            | self.bodies,
         }
-        how = {"dimension": self.dimension, "cells": cells, "rigid_dt": self.rigid_dt} | dict(self.fidelity)
+        how = {"dimension": self.dimension, "cells": cells, "rigid_dt": self.rigid_dt} | self.fidelity
         return build(parse(SceneConfig, config, "bed"), Fidelity(**how))
 
     @cache

@@ -84,7 +84,7 @@ class Grid:
         return int(np.prod(self.shape))
 
     def inner_shares(self) -> np.ndarray:
-        """Share (*shape) of each node's window that lies inside the box, of a node beyond the first layer outside, 1."""
+        """Share (*shape) of each node's window that lies inside the box; 1 for nodes that no grain inside reaches."""
         shares = []
         for n, cells in zip(self.shape, self.cells, strict=True):
             inside = np.minimum(np.arange(n) - MARGIN, MARGIN + cells - np.arange(n))  # cells from the nearer wall

@@ -100,10 +100,13 @@ struct Constraints {
   }
 
   // The change c of joint velocities q for which M c = load + J^T (p(q + c) - given), from a guess of it.
-  Settled settled(const Vector& M, const Vector& q, const Vector& load, const Vector& guess, double rounding) const {
+  // What remains is measured in the metric, by default the inverse of M.
+  Settled settled(const Vector& M, const Vector& q, const Vector& load, const Vector& guess, double rounding,
+                  const Vector* own_metric = nullptr) const {
     Vector metric(nv * nv, 0), H(M), c(guess), at(nv), step(nv), held(nv, 0), all(nv, 0), tried(nv);
     for (int a = 0; a < nv; ++a) metric[a * nv + a] = 1;
-    solve(H, metric, nv, nv);
+    if (own_metric) metric = *own_metric;
+    else solve(H, metric, nv, nv);
     auto remains = [&](const Vector& c) {
       for (int a = 0; a < nv; ++a) at[a] = q[a] + c[a];
       Vector R = times(M, c);

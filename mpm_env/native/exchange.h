@@ -114,15 +114,18 @@ Outcome exchange(Crowd<S>& crowd, const Vector& M, const Constraints& rows, cons
       }
     }
   }
+  Vector points_mass(nv * nv);
   for (int a = 0; a < nv; ++a) {
     metric[a * nv + a] = 1;
     stick[a] = total(stuck[a]);
-    for (int b = 0; b <= a; ++b) { double m = total(sum[a * nv + b]); H[a * nv + b] += m; if (b < a) H[b * nv + a] += m; }
+    for (int b = 0; b <= a; ++b) points_mass[a * nv + b] = points_mass[b * nv + a] = total(sum[a * nv + b]);
   }
+  for (int j = 0; j < nv * nv; ++j) H[j] += points_mass[j];
   for (int i = 0; i < rows.count; ++i)
     if (held.given[i] > rows.low[i] && held.given[i] < rows.high[i])
       for (int a = 0; a < nv; ++a)
         for (int b = 0; b < nv; ++b) H[a * nv + b] += rows.D[i] * rows.J[i * nv + a] * rows.J[i * nv + b];
+  const Vector stuck_mass(H);
   solve(H, metric, nv, nv);
 
   // The equation's remainder for a change of q, and its size in the metric.
@@ -135,8 +138,39 @@ Outcome exchange(Crowd<S>& crowd, const Vector& M, const Constraints& rows, cons
   };
 
   Vector change(nv, 0), R(nv), tried(nv), R_tried(nv), best_change(nv), best_R(nv);
-  // The best of some shares of a step, if it helps; sets what remains then. Returns whether it did.
+  // The best of some changes of q, if it helps; sets what remains then. Returns whether it did.
   double size = 0;
+  auto nearest_of = [&](const Vector* changes, int count) {
+    for (int j = 0; j < count * nv; ++j) sum[j] = Pack<S>(S(0));
+    std::vector<S> further(size_t(count) * nv);
+    for (int j = 0; j < count; ++j) for (int a = 0; a < nv; ++a) further[j * nv + a] = S(changes[j][a] - change[a]);
+    for (int k = 0; k < packs; ++k) {
+      const Pack<S>*p = crowd.of(k), *lever = p + LEVER;
+      for (int j = 0; j < count; ++j) {
+        Rows<S> w = {p[SPEED], p[SPEED + 1], p[SPEED + 2]}, f;
+        for (int a = 0; a < nv; ++a) for (int i = 0; i < 3; ++i) w[i] = w[i] - further[j * nv + a] * lever[3 * a + i];
+        impulses<S>(p, w, f);
+        for (int a = 0; a < nv; ++a) {
+          const Pack<S>* A = lever + 3 * a;
+          sum[j * nv + a] = sum[j * nv + a] + f[0] * A[0] + f[1] * A[1] + f[2] * A[2];
+        }
+      }
+    }
+    int best = -1;
+    double least = 0;
+    for (int j = 0; j < count; ++j) {
+      const double s = left_over(changes[j], sum + j * nv, R_tried);
+      if (best < 0 || !(s >= least)) { best = j; least = s; best_R = R_tried; }
+    }
+    if (!(least < size)) return false;
+    for (int k = 0; k < packs; ++k) {
+      Pack<S>*p = crowd.of(k), *lever = p + LEVER;
+      for (int a = 0; a < nv; ++a) for (int i = 0; i < 3; ++i) p[SPEED + i] = p[SPEED + i] - further[best * nv + a] * lever[3 * a + i];
+    }
+    change = changes[best]; R = best_R; size = least;
+    return true;
+  };
+  // The same among some shares of a step.
   auto nearer = [&](const Vector& step, int shares) {
     for (int j = 0; j < shares * nv; ++j) sum[j] = Pack<S>(S(0));
     for (int k = 0; k < packs; ++k) {
@@ -167,13 +201,30 @@ Outcome exchange(Crowd<S>& crowd, const Vector& M, const Constraints& rows, cons
       for (int i = 0; i < 3; ++i) crowd.of(k)[SPEED + i] = crowd.of(k)[SPEED + i] - S(STEP[best]) * moved[3 * k + i];
     return true;
   };
+  // The change of q by a Newton step from `change` for points of stiffness K that pull so, which the constraints take
+  // to the full: their kinks would stop a line search. Shorter steps are those of heavier points.
+  Constraints later(rows);
+  later.given = held.given;
+  auto held_step = [&](const Vector& K, const Vector& pulled, double share) {
+    Vector A(K), whole(M);
+    for (int j = 0; j < nv * nv; ++j) { A[j] += (1 / share - 1) * stuck_mass[j]; whole[j] += A[j]; }
+    Vector load = times(A, change);
+    for (int a = 0; a < nv; ++a) load[a] -= pulled[a];
+    return later.settled(whole, q_held, load, change, rounding, &metric).change;
+  };
 
   size = std::numeric_limits<double>::infinity();
   nearer(Vector(nv, 0), 1);  // no contact: only what remains of the equation is wanted
   const double none = size, enough = SOLVED * rounding * none;
-  Vector step(nv, 0);
-  for (int a = 0; a < nv; ++a) for (int b = 0; b < nv; ++b) step[a] += metric[a * nv + b] * stick[b];
-  nearer(step, 1);
+  Vector step = times(metric, stick);
+  if (constrained) {
+    Vector pulled(nv);
+    for (int a = 0; a < nv; ++a) pulled[a] = -stick[a];
+    step = held_step(points_mass, pulled, 1);
+    nearest_of(&step, 1);
+  } else {
+    nearer(step, 1);
+  }
   bool going = size > enough;
   for (int it = 0; going && it < iterations; ++it) {
     for (int j = 0; j < nv * nv; ++j) sum[j] = Pack<S>(S(0));
@@ -192,10 +243,19 @@ Outcome exchange(Crowd<S>& crowd, const Vector& M, const Constraints& rows, cons
         }
       }
     }
+    if (constrained) {
+      Vector K(nv * nv), pulled(R), tries[STEPS];  // R = M change - J^T (p - given) + pulled
+      for (int j = 0; j < nv * nv; ++j) K[j] = total(sum[j]);
+      const Vector M_change = times(M, change);
+      for (int a = 0; a < nv; ++a) { pulled[a] -= M_change[a]; moved_q[a] = q_held[a] + change[a]; }
+      rows.take(held.given, rows.pushes(moved_q), pulled);
+      for (int j = 0; j < STEPS; ++j) tries[j] = held_step(K, pulled, STEP[j]);
+      going = nearest_of(tries, STEPS) && size > enough;
+      continue;
+    }
     H = M;
     for (int j = 0; j < nv * nv; ++j) H[j] += total(sum[j]);
-    for (int a = 0; a < nv; ++a) { step[a] = -R[a]; moved_q[a] = q_held[a] + change[a]; }
-    if (constrained) rows.stiffen(moved_q, H);
+    for (int a = 0; a < nv; ++a) step[a] = -R[a];
     solve(H, step, nv, 1);
     going = nearer(step, STEPS) && size > enough;
   }
