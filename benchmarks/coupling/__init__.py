@@ -1,0 +1,1 @@
+"""What bodies do in grains, held against experiments and limit theorems: suites that measure physics, not time."""
