@@ -49,7 +49,7 @@ def _geom(kind: str, rho: float) -> tuple[str, str]:
 
 
 @cache
-def drop_scene(kind: str, cells: int, band: float, whole: bool) -> Scene:
+def drop_scene(kind: str, cells: int, band: float, courant: float, whole: bool) -> Scene:
     """A "ball" or "cone" as dense as the sand, a cell above a bed with so many cells to SIZE."""
     side, surface = WALLS * SIZE, DEPTH * SIZE
     low = -side if whole else 0.0
@@ -71,7 +71,8 @@ def drop_scene(kind: str, cells: int, band: float, whole: bool) -> Scene:
             "friction": FRICTION,
         },
     }
-    return build(SceneConfig(**config), Fidelity(cells=cells, rigid_dt=RIGID_DT, contact_band=band))
+    fidelity = Fidelity(cells=cells, rigid_dt=RIGID_DT, courant=courant, contact_band=band)
+    return build(SceneConfig(**config), fidelity)
 
 
 class Drop(NamedTuple):
@@ -90,15 +91,16 @@ def drop(
     ratio: float,
     *,
     band: float = 0.5,
+    courant: float = 0.5,
     whole: bool = False,
     friction_deg: float | None = None,
     longest: float = LONGEST,
 ) -> Drop:
     """Drop a body `ratio` times as dense as the sand from this height (m) over the bed, until it lies still.
 
-    band is the fidelity's contact_band; friction_deg of the sand, if not REPOSE's.
+    band and courant are the fidelity's contact_band and courant; friction_deg of the sand, if not REPOSE's.
     """
-    scene, surface = drop_scene(kind, cells, band, whole), DEPTH * SIZE
+    scene, surface = drop_scene(kind, cells, band, courant, whole), DEPTH * SIZE
     gap, up = SIZE / cells, 2 if whole else 0
     state = at_rest(scene, with_sand(started(scene), denser=1 / ratio, friction_deg=friction_deg), surface)
     speed = np.sqrt(2 * G * (height - gap))
@@ -188,7 +190,10 @@ Dropped = TypeVar("Dropped", Sweep, Cones)
 
 
 def limit(runs: dict[int, Dropped]) -> Dropped:
-    """What runs with these cells to SIZE tend to for ever finer ones: bodies stand off sand in proportion to cells."""
+    """What runs with these cells to SIZE tend to for ever finer ones.
+
+    Bodies stand off sand in proportion to cells, and at one Courant number the transfers' viscosity is so too.
+    """
     cell, of = 1 / np.array(list(runs)), next(iter(runs.values()))
     depths = {key: line(cell, np.array([r.depths[key] for r in runs.values()])).start for key in of.depths}
     health = int(np.bitwise_or.reduce([r.health for r in runs.values()]))

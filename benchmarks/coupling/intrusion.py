@@ -31,11 +31,11 @@ from mpm_env import Fidelity, Scene, SceneConfig, build
 
 SIDE = 0.1  # m, of the plate
 THICK = 0.2  # of SIDE
-HALF_LENGTH, HALF_WIDTH, DEPTH, ABOVE = 3.0, 2.5, 4.0, 1.5  # times SIDE, of the bed and of the space above it
+HALF_LENGTH, HALF_WIDTH, DEPTH, ABOVE = 2.5, 2.0, 3.0, 1.0  # times SIDE, of the bed and of the space above it
 FRICTION_DEG = 30.0
 FRICTION = 0.4  # of sand and plate
 E = 1e6  # Pa
-SPEED, RAMP = 0.2, 0.05  # m/s and s: the pressure rho v^2 of moving sand is 60 Pa, of kilopascals on the plate
+SPEED, RAMP = 0.1, 0.05  # m/s and s: the pressure rho v^2 of moving sand is 15 Pa, of kilopascals on the plate
 RIGID_DT = 0.004  # s
 UNIT = RHO * G * SIDE**3  # N, in which forces are told: the weight of a cube of sand on the plate
 HOLDING = (0.3, 0.6)  # of SIDE, the travel over which a drag's force is averaged: it has risen, and not yet piled up
