@@ -69,10 +69,10 @@ def bed(cells: int) -> Scene:
 
 
 class Cut(NamedTuple):
-    """What the sand did to a blade of this rake; forces per metre of width."""
+    """What the sand did to a blade; rows are rigid steps."""
 
     travel: np.ndarray  # (k,) of DEPTH
-    push: np.ndarray  # (k,) the force over rho g DEPTH^2, all of it: N_gamma of the earth-moving equation
+    push: np.ndarray  # (k,) the force over rho g DEPTH^2, all of it
     draft: np.ndarray  # (k,) its part against the travel, so scaled
     health: int
     cpu_s: float
@@ -82,13 +82,13 @@ class Cut(NamedTuple):
         return float(values[(self.travel >= WINDOW[0]) & (self.travel <= WINDOW[1])].mean())
 
     @property
-    def K(self) -> float:
-        """The pressure coefficient of an upright wall."""
+    def pressure(self) -> float:
+        """Rankine's K, of an upright wall."""
         return 2 * self.mean(self.draft)
 
     @property
-    def N(self) -> float:
-        """N_gamma."""
+    def resistance(self) -> float:
+        """N_gamma of the earth-moving equation."""
         return self.mean(self.push)
 
 

@@ -161,7 +161,7 @@ def plates(cells: int) -> list[Case]:
         ]
     plot(
         results.FOLDER / "penetration_plates.png",
-        "A square plate through sand: pushed down, and dragged at a depth of its side",
+        "A square plate pushed down, and dragged at a depth of its side",
         "depth of the first, travel of the others, over the side",
         "force / rho g side^3",
         [
@@ -182,35 +182,40 @@ def walls(cells: int) -> list[Case]:
         resolution, band = f"{cells} cells to the depth", within(reference, share)
         return Case(f"wall, phi {name}", source, reference, band, value, resolution, run.cpu_s, run.health)
 
-    lines = [Series("", [0, 0.1], [cutting.passive(phi)] * 2, joined=True) for phi in done]
+    lines = [Series("", [0, 0.1], [cutting.passive(phi)] * 2, True, k) for k, phi in enumerate(done)]
     plot(
         results.FOLDER / "penetration_walls.png",
         f"A smooth wall pushed into sand {cells} cells deep; straight lines: Rankine",
         "travel / depth",
         "K",
-        [*(Series(f"phi {phi:.0f}", c.travel, 2 * c.draft, joined=True) for phi, c in done.items()), *lines],
+        [
+            *(Series(f"phi {phi:.0f}", c.travel, 2 * c.draft, True, k) for k, (phi, c) in enumerate(done.items())),
+            *lines,
+        ],
+        names_below=True,
     )
+    same = slow.pressure / done[30.0].pressure
     return [
-        *(case(f"{phi:.0f}: K", "Rankine", cutting.passive(phi), 0.15, c.K, c) for phi, c in done.items()),
-        case("30: K at a fifth of the speed over K", "sand has no rate", 1, 0.05, slow.K / done[30.0].K, slow),
-        case("0: K", "hydrostatics", 1, 0.15, fluid.K, fluid),
+        *(case(f"{phi:.0f}: K", "Rankine", cutting.passive(phi), 0.15, c.pressure, c) for phi, c in done.items()),
+        case("30: K at a fifth of the speed over K", "sand has no rate", 1, 0.05, same, slow),
+        case("0: K", "hydrostatics", 1, 0.15, fluid.pressure, fluid),
     ]
 
 
 def blades(cells: int) -> list[Case]:
     """Inclined blades, smooth and rough, against the earth-moving equation."""
     out, series, resolution = [], [], f"{cells} cells to the depth"
-    for blade, rake in itertools.product(cutting.BLADES, (45.0, 60.0)):
+    for k, (blade, rake) in enumerate(itertools.product(cutting.BLADES, (45.0, 60.0))):
         laws = [cutting.earth_moving(phi, rake, cutting.BLADES[blade]) for phi in FRICTIONS]
         done = [cutting.cut(cells, phi, rake, blade) for phi in FRICTIONS]
         for phi, N, c in zip(FRICTIONS, laws, done, strict=True):
             name = f"{blade} blade, rake {rake:.0f}, phi {phi:.0f}: N"
-            out.append(Case(name, "Reece, McKyes", N, within(N, 0.3), c.N, resolution, c.cpu_s, c.health))
-        series.append(Series(f"{blade}, rake {rake:.0f}, and its equation", FRICTIONS, [c.N for c in done]))
-        series.append(Series("", FRICTIONS, laws, joined=True))
+            out.append(Case(name, "Reece, McKyes", N, within(N, 0.3), c.resistance, resolution, c.cpu_s, c.health))
+        series.append(Series(f"{blade}, rake {rake:.0f}", FRICTIONS, [c.resistance for c in done], colour=k))
+        series.append(Series("", FRICTIONS, laws, joined=True, colour=k))
     plot(
         results.FOLDER / "penetration_blades.png",
-        f"Blades through sand {cells} cells deep, and the earth-moving equation",
+        f"Blades through sand {cells} cells deep; lines: the earth-moving equation",
         "friction angle, degrees",
         "N",
         series,
@@ -231,6 +236,7 @@ def dropped(quick: bool) -> list[Case]:
         "depth, m",
         [Series(UEHARA, fall, law, joined=True), *series, *more],
         log=True,
+        names_below=True,
     )
     return usual + inside + one_ball(6) + cones((6,) if quick else (6, 8, 12))
 

@@ -22,10 +22,13 @@ class Series(NamedTuple):
     x: Sequence[float] | np.ndarray
     y: Sequence[float] | np.ndarray
     joined: bool = False
+    colour: int | None = None  # of COLOURS, if not the next: that of what belongs to it
 
 
-def plot(path: Path, title: str, x: str, y: str, series: Sequence[Series], *, log: bool = False) -> None:
-    """Write a plot; axes named x and y, both logarithmic where asked for."""
+def plot(
+    path: Path, title: str, x: str, y: str, series: Sequence[Series], *, log: bool = False, names_below: bool = False
+) -> None:
+    """Write a plot; axes named x and y, both logarithmic where asked for; names of series above or below."""
     scale = np.log10 if log else np.asarray
     points = [np.stack([scale(np.asarray(a, float)) for a in (s.x, s.y)]) for s in series]
     low, high = (f(np.concatenate(points, axis=1), axis=1) for f in (np.min, np.max))
@@ -48,16 +51,20 @@ def plot(path: Path, title: str, x: str, y: str, series: Sequence[Series], *, lo
             spot, anchor = ((u, bottom + 6), "mt") if axis == 0 else ((left - 6, v), "rm")
             draw.text(spot, f"{tick:g}", fill=INK, font=font, anchor=anchor)
     draw.rectangle([left, top, right, bottom], outline=INK)
-    draw.text(((left + right) / 2, 8), title, fill=INK, font=font, anchor="mt")
+    draw.text((right, 8), title, fill=INK, font=font, anchor="rt")
     draw.text(((left + right) / 2, SIZE[1] - 8), x, fill=INK, font=font, anchor="mb")
     draw.text((8, 8), y, fill=INK, font=font, anchor="lt")
+    named = [s.name for s in series if s.name]
+    first = bottom - 10 - 16 * len(named) if names_below else top + 8
     for k, (s, at) in enumerate(zip(series, points, strict=True)):
-        colour, spots = COLOURS[k % len(COLOURS)], place(at)
+        colour, spots = COLOURS[(k if s.colour is None else s.colour) % len(COLOURS)], place(at)
         if s.joined:
             draw.line(spots, fill=colour, width=2)
         for u, v in [] if s.joined else spots:
             draw.ellipse([u - 4, v - 4, u + 4, v + 4], fill=colour)
-        draw.text((left + 10, top + 8 + 16 * k), s.name, fill=colour, font=font)
+        if s.name:
+            spot, anchor = ((right - 10, 0), "rt") if names_below else ((left + 10, 0), "lt")
+            draw.text((spot[0], first + 16 * named.index(s.name)), s.name, fill=colour, font=font, anchor=anchor)
     image.save(path, optimize=True)
 
 
