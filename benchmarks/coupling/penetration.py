@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import itertools
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -249,9 +250,17 @@ def main() -> None:
     job.pin(1)
     results.FOLDER.mkdir(exist_ok=True)
     cells = 8 if quick else 32
-    told = [case.told() for case in (*walls(cells), *blades(cells), *plates(4 if quick else 8), *dropped(quick))]
-    for case in told:
-        print(f"{case['verdict']:7}{case['name']:50}{case['value']:9.4g}{case['reference']:9.4g}  {case['resolution']}")
+    told: list[dict[str, Any]] = []
+    for cases in (
+        partial(walls, cells),
+        partial(blades, cells),
+        partial(plates, 4 if quick else 8),
+        partial(dropped, quick),
+    ):
+        for case in (c.told() for c in cases()):
+            value, reference = case["value"], case["reference"]
+            print(f"{case['verdict']:7}{case['name']:50}{value:9.4g}{reference:9.4g}  {case['resolution']}", flush=True)
+            told.append(case)
     results.write("penetration", {"quick": quick, "cases": told})
 
 
