@@ -122,8 +122,8 @@ def impulses(p: Points, w: Array, surface: Surface) -> Array:
     """Impulses (3, .., K) N s on points that move with w (3, .., K) m/s relative to their body.
 
     A point that separates gets none, or where the surface is sticky as much as keeps it, up to the hold. One that
-    approaches loses its approach, but for the slack. By Coulomb's bound on the tangential impulse, mu times the normal one beyond the
-    pull that the surface can give, it loses all or part of its sliding. The law only dissipates.
+    approaches loses its approach, but for the slack. By Coulomb's bound on the tangential impulse, mu times the normal
+    one beyond the pull that the surface can give, it loses all or part of its sliding. The law only dissipates.
     """
     approach = -dot(w, p.n)
     w_t = [a + approach * n for a, n in zip(w, p.n, strict=True)]

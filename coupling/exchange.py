@@ -121,6 +121,7 @@ def exchange(
 
         Their kinks would stop a line search; so shorter steps are not shares of it, but steps of heavier points.
         """
+        assert rows is not None
         A = K + (1 / share - 1) * stuck_mass
         return settled(t.M + A, rows._replace(given=held.given), q_held, A @ x - pulled, x, metric).change
 

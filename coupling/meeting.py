@@ -20,6 +20,8 @@ from coupling.exchange import Exchange, Twists, exchange
 from coupling.geoms import Shape, bounding_radius, dot
 from mpm_env import native
 
+NO_GAP = 0.25  # cells; what a node tells of its material's surface is no more exact than that
+CLOSED = 0.1  # of a gap closes in a substep, at most: if all could, contact would come and go, and friction with it
 LEAST_NORMAL = 1e-6  # of a normal's part in the plane of plane strain; a shorter one is no direction
 
 
@@ -78,7 +80,7 @@ def meet(
     those in line with each other add up to one at full weight.
 
     A node has mass from 1.5 cells before the material's surface on, so by its share of the full mass it tells how far
-    away that surface is, see `depth_of`, and meets the body only when that gap would close within the substep.
+    away that surface is, see `depth_of`, and meets the body only when that gap closes.
     """
 
     def reference(
@@ -91,9 +93,9 @@ def meet(
         meets = (m > 0) & (phi < reach)
         shares = jnp.ones((1, 1), x.dtype) if s.shares is None else s.shares
         weight = jnp.maximum(1 - jnp.abs(phi - (reach - g.layer)) / g.layer, 0)
-        slack = 0.0
+        slack = jnp.zeros_like(phi)
         if s.full is not None:
-            slack = jnp.maximum(phi - g.layer * depth_of(m / s.full), 0) / g.dt
+            slack = jnp.maximum(phi - g.layer * (depth_of(m / s.full) + NO_GAP), 0) * (CLOSED / g.dt)
         surface = Surface(dot(s.mu[geom].T, shares), weight * dot(s.hold, shares), slack)
         points = Points(x, v, jnp.where(meets, m, 0), phi, n, geom)
         done = exchange(points, t, q_free, surface, g.body_of, g.iterations)

@@ -1,1 +1,1 @@
-"""What contact between grains and bodies is worth: scenes with known answers, measured, for docs/coupling.md and tests."""
+"""What contact between grains and bodies is worth: scenes with known answers, measured, and shared with tests."""

@@ -1,7 +1,7 @@
 """A blade driven through a bed: how much sand passes through it, and how far its force is from a fine grid's.
 
-The blade reaches 10 cm into a bed of 20 cm and moves at 0.3 m/s after a soft start. In plane strain the reference is the
-same blade on a grid four times as fine, where it is at least two cells thick.
+The blade reaches 10 cm into a bed of 20 cm and moves at 0.3 m/s after a soft start. In plane strain the reference is
+the same blade on a grid so fine that it is at least two cells thick.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 from functools import cache
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation

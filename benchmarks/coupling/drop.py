@@ -71,7 +71,7 @@ def dropped(bed: Bed, ratio: float, seconds: float) -> tuple[Drop, np.ndarray]:
     """Drop it; also its height (k,) m over the rigid steps."""
     scene = bed.scene()
     count = round(seconds / bed.rigid_dt)
-    last, steps = run(scene, settled_below(bed, ratio), count)
+    _, steps = run(scene, settled_below(bed, ratio), count)
     mass = scene.bodies.model.body_mass[1]
     gap = scene.bodies.model.qpos0[2] - HALF[2] - bed.fills[0][1][2]
     impact = np.sqrt(2 * G * gap)

@@ -52,7 +52,7 @@ class Bed:
     fidelity: dict[str, Any] = field(default_factory=dict)  # what differs from the default
     bodies: dict[str, Any] = field(default_factory=dict)  # more of BodiesConfig
 
-    @cache
+    @cache  # noqa: B019  a process builds few of them
     def scene(self) -> Scene:
         """Built."""
         cells = 2
@@ -75,7 +75,7 @@ class Bed:
         how = {"dimension": self.dimension, "cells": cells, "rigid_dt": self.rigid_dt} | self.fidelity
         return build(parse(SceneConfig, config, "bed"), Fidelity(**how))
 
-    @cache
+    @cache  # noqa: B019
     def start(self) -> State:
         """Grains as seeded, bodies as in the model."""
         return jax.jit(partial(initial, self.scene()))(jax.random.key(0))
@@ -122,7 +122,7 @@ def run(scene: Scene, state: State, count: int, drives: Drive | None = None) -> 
 
 
 def settled(scene: Scene, state: State, rounds: int = 4) -> State:
-    """The state with its grains come to rest, by taking all speed out of them now and then; bodies stay where they are."""
+    """The state with its grains come to rest, by taking all speed out of them now and then; bodies stay in place."""
     there = state.rigid
     for _ in range(rounds):
         state, _ = run(scene, state, STRIDE)

@@ -103,18 +103,14 @@ def at_the_limit() -> Bed:
     return bed(gate, ("gate",), (0.225, 0.6, 0, 0.2), friction=0.2)
 
 
-def explicit(
-    p: Points, t: Twists, q_free: jax.Array, surface: Surface, body_of: tuple[int, ...], _: int
-) -> Exchange:
+def explicit(p: Points, t: Twists, q_free: jax.Array, surface: Surface, body_of: tuple[int, ...], _: int) -> Exchange:
     """Negative control: the same law at the velocity without contact, its impulses paid at once."""
     done = staggered(p, t, q_free, surface, body_of, 0)
     pull = jnp.einsum("gkn,gk->n", t.J[np.asarray(body_of)], done.wrench)
     return done._replace(q=q_free + jnp.linalg.solve(t.M, pull))
 
 
-def staggered(
-    p: Points, t: Twists, q_free: jax.Array, surface: Surface, body_of: tuple[int, ...], _: int
-) -> Exchange:
+def staggered(p: Points, t: Twists, q_free: jax.Array, surface: Surface, body_of: tuple[int, ...], _: int) -> Exchange:
     """Negative control: bodies go as without grains, and get the impulses at the rigid step's end."""
     as_told = t._replace(J=t.J[:, :, :0], M=t.M[:0, :0], d=t.J @ q_free + t.d, rows=None)
     done = exchange(p, as_told, q_free[:0], surface, body_of, 0)
@@ -146,7 +142,9 @@ class Held(NamedTuple):
 def held(scene: Scene, state: State, count: int) -> tuple[Held, Steps]:
     """So many rigid steps from here."""
     _, steps = run(scene, state, count)
-    force = steps.reaction[-LAST:, :, :3].sum(axis=1) if len(scene.bodies.bodies) == 1 else steps.reaction[-LAST:, 0, :3]
+    force = (
+        steps.reaction[-LAST:, :, :3].sum(axis=1) if len(scene.bodies.bodies) == 1 else steps.reaction[-LAST:, 0, :3]
+    )
     mean = force.mean(axis=0)
     size = np.linalg.norm(mean)
     return Held(

@@ -7,7 +7,7 @@
 namespace MPM_ISA {
 namespace {
 
-constexpr double LEAST_NORMAL = 1e-6, LEAST_FILL = 1e-6;  // those of meeting.py and contact.py
+constexpr double LEAST_NORMAL = 1e-6, LEAST_FILL = 1e-6, NO_GAP = 0.25, CLOSED = 0.1;  // those of meeting.py and contact.py
 
 // Rows (3, count) from point i on, a pack; beyond the last point, that one again.
 template <class S> INLINE void load(const S* a, int64_t count, int64_t i, Rows<S>& x) {
@@ -141,8 +141,8 @@ template <class S> void run(const Meet& t, int64_t b) {
     }
     mine[FRICTION * W] = friction;
     mine[HOLD * W] = hold;
-    const S gap = t.gaps ? phi[i] - S(t.layer) * depth_of(m[i] / t.full.of<S>(b)[i]) : S(0);
-    mine[SLACK * W] = std::max(gap, S(0)) / S(t.dt);
+    const S gap = t.gaps ? phi[i] - S(t.layer) * (depth_of(m[i] / t.full.of<S>(b)[i]) + S(NO_GAP)) : S(0);
+    mine[SLACK * W] = std::max(gap, S(0)) * S(CLOSED / t.dt);
   }
 
   Constraints rows{int(t.rows), int(nv)};

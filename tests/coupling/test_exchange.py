@@ -238,7 +238,7 @@ def test_a_sticky_surface_holds_a_point_up_to_its_hold_and_rubs_by_what_is_left_
 def test_stiffness_of_a_sticky_surface_is_the_derivative_of_its_law() -> None:
     p, w, mu = random_law()
     with jax.enable_x64(True):
-        law = Surface(jnp.asarray(mu), jnp.full(len(w), 0.2))
+        law = Surface(jnp.asarray(mu), jnp.full(len(w), 0.2), jnp.full(len(w), 0.1))
         slope = jax.vmap(jax.jacfwd(lambda w, p, law: impulses(p, w, law)))
         p, w = jax.tree.map(jnp.asarray, (p, w))
         found, exact = np.moveaxis(stiffness(as_rows(p), w.T, law), -1, 0), -np.asarray(slope(w, p, law))

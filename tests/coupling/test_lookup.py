@@ -71,7 +71,7 @@ def test_watched_nodes_know_the_materials_around_them_and_those_without_take_the
     np.testing.assert_allclose(shares.sum(axis=0)[here], 1, rtol=1e-6)
     x, z = np.asarray(one.nodes_x)[[0, 2]]
     low = here & (z < 0.11)
-    for expected, some in (([1, 0], low & (x < 0.14)), ([0, 1], low & (x > 0.26)), ([0.5, 0.5], here & (z > 0.15))):
+    for expected, some in (([1, 0], low & (x < 0.14)), ([0, 1], low & (x > 0.26)), ([0.5, 0.5], here & (z > 0.14))):
         assert some.any()
         assert np.abs(shares[:, some].T - expected).max() < 1e-6
 

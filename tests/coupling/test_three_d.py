@@ -43,6 +43,7 @@ REST, MEAN = 150, 75  # rigid steps on the bed, and the last of them that are av
 EXCHANGED_TOLERANCE = 1e-5  # of the impulse exchanged so far, as is asked of float32; 3e-7 observed
 PAID_TOLERANCE = 1e-5  # of the step's impulse; 1e-6 observed while they collide, and on top of it
 PAID_DIGITS = 5e-7  # N s: the last digits of the box's 3.6 N s; 1.4e-7 observed
+TURNING_DIGITS = 1e-4  # N m s, before they meet: the box's free turning by a step's end; 6e-5 observed
 # Of the angular impulse exchanged. As in MuJoCo, a step's torque and inertia are those of its start, while the box
 # turns on by this angle: O(dt). Half of it observed.
 ANGULAR_TOLERANCE = DT * float(np.linalg.norm(SPIN))
@@ -160,7 +161,7 @@ def test_sand_and_a_box_thrown_at_each_other_keep_momentum() -> None:
     f = flight()
     exchanged = np.cumsum(size(np.diff(f.body, axis=0)))
     assert exchanged[-1] > 1, "they hardly met"  # N s
-    assert np.all(size(f.total[1:] - f.total[0]) < EXCHANGED_TOLERANCE * exchanged)
+    assert np.all(size(f.total[1:] - f.total[0]) < EXCHANGED_TOLERANCE * exchanged + PAID_DIGITS)
 
 
 def test_each_step_pays_the_box_what_its_reaction_says() -> None:
@@ -173,7 +174,7 @@ def test_sand_and_a_box_thrown_at_each_other_keep_angular_momentum() -> None:
     f = flight()
     exchanged = np.cumsum(size(np.diff(f.body_turning, axis=0)))
     assert exchanged[-1] > 0.05, "they hardly turned each other"  # N m s
-    assert np.all(size(f.turning[1:] - f.turning[0]) < ANGULAR_TOLERANCE * exchanged)
+    assert np.all(size(f.turning[1:] - f.turning[0]) < ANGULAR_TOLERANCE * exchanged + TURNING_DIGITS)
 
 
 def test_the_toss_is_well_and_away_from_the_walls() -> None:
