@@ -39,6 +39,7 @@ def drop(dimension: int, dx: float, E: float = 3e6, phase: float = 0.0, gap: flo
         dx,
         dimension,
         material={"E": E},
+        fidelity={"contact_iterations": 8},  # for boxes as light as foam
     )
 
 
