@@ -49,7 +49,7 @@ def _geom(kind: str, rho: float) -> tuple[str, str]:
 
 
 @cache
-def drop_scene(kind: str, cells: int, band: float, courant: float, whole: bool) -> Scene:
+def drop_scene(kind: str, cells: int, courant: float, whole: bool) -> Scene:
     """A "ball" or "cone" as dense as the sand, a cell above a bed with so many cells to SIZE."""
     side, surface = WALLS * SIZE, DEPTH * SIZE
     low = -side if whole else 0.0
@@ -71,8 +71,7 @@ def drop_scene(kind: str, cells: int, band: float, courant: float, whole: bool) 
             "friction": FRICTION,
         },
     }
-    fidelity = Fidelity(cells=cells, rigid_dt=RIGID_DT, courant=courant, contact_band=band)
-    return build(SceneConfig(**config), fidelity)
+    return build(SceneConfig(**config), Fidelity(cells=cells, rigid_dt=RIGID_DT, courant=courant))
 
 
 class Drop(NamedTuple):
@@ -90,7 +89,6 @@ def drop(
     height: float,
     ratio: float,
     *,
-    band: float = 0.5,
     courant: float = 0.5,
     whole: bool = False,
     friction_deg: float | None = None,
@@ -98,9 +96,9 @@ def drop(
 ) -> Drop:
     """Drop a body `ratio` times as dense as the sand from this height (m) over the bed, until it lies still.
 
-    band and courant are the fidelity's contact_band and courant; friction_deg of the sand, if not REPOSE's.
+    courant is the fidelity's; friction_deg of the sand, if not REPOSE's.
     """
-    scene, surface = drop_scene(kind, cells, band, courant, whole), DEPTH * SIZE
+    scene, surface = drop_scene(kind, cells, courant, whole), DEPTH * SIZE
     gap, up = SIZE / cells, 2 if whole else 0
     state = at_rest(scene, with_sand(started(scene), denser=1 / ratio, friction_deg=friction_deg), surface)
     speed = np.sqrt(2 * G * (height - gap))
@@ -142,10 +140,10 @@ class Sweep(NamedTuple):
         return {key: depth / uehara(*key) for key, depth in self.depths.items()}
 
 
-def sweep(cells: int, band: float = 0.5) -> Sweep:
+def sweep(cells: int) -> Sweep:
     """Drop all balls."""
     keys = [(h, RATIOS[1]) for h in HEIGHTS] + [(HEIGHTS[1], r) for r in RATIOS if r != RATIOS[1]]
-    done = {key: drop("ball", cells, *key, band=band) for key in keys}
+    done = {key: drop("ball", cells, *key) for key in keys}
     health = int(np.bitwise_or.reduce([d.health for d in done.values()]))
     return Sweep({key: d.depth for key, d in done.items()}, health, sum(d.cpu_s for d in done.values()))
 
@@ -179,9 +177,9 @@ class Cones(NamedTuple):
         return exponent(ratio * (height + depth), depth)
 
 
-def cones(cells: int, band: float = 0.5) -> Cones:
+def cones(cells: int) -> Cones:
     """Drop all cones."""
-    done = {key: drop("cone", cells, *key, band=band) for key in CONE_DROPS}
+    done = {key: drop("cone", cells, *key) for key in CONE_DROPS}
     health = int(np.bitwise_or.reduce([d.health for d in done.values()]))
     return Cones({key: d.depth for key, d in done.items()}, health, sum(d.cpu_s for d in done.values()))
 
@@ -192,14 +190,9 @@ Dropped = TypeVar("Dropped", Sweep, Cones)
 def limit(runs: dict[int, Dropped]) -> Dropped:
     """What runs with these cells to SIZE tend to for ever finer ones.
 
-    Bodies stand off sand in proportion to cells, and at one Courant number the transfers' viscosity is so too.
+    At one Courant number the viscosity of transfers is in proportion to cells, as is how far bodies stand off sand.
     """
     cell, of = 1 / np.array(list(runs)), next(iter(runs.values()))
     depths = {key: line(cell, np.array([r.depths[key] for r in runs.values()])).start for key in of.depths}
     health = int(np.bitwise_or.reduce([r.health for r in runs.values()]))
     return of._replace(depths=depths, health=health, cpu_s=sum(r.cpu_s for r in runs.values()))
-
-
-def stand_off(cells: int, coarse: Dropped, fine: Dropped) -> float:
-    """Mean depth (cells) that bodies lack at this resolution against a finer one, or the limit."""
-    return float(np.mean([fine.depths[key] - coarse.depths[key] for key in fine.depths]) * cells / SIZE)

@@ -125,6 +125,58 @@ def push(cells: int, motion: Motion, friction_deg: float = FRICTION_DEG, speed: 
     return Push(travel, motion.depth - travel * motion.way[1], force, int(done.last.health), done.cpu_s)
 
 
+FOOTING = 0.025  # m, a cell
+FOOTING_WIDTH = 0.1  # m, of the slice
+FOOTING_BED = (1.0, 0.4)  # m, across and deep
+PRESSED, HELD = 0.05, 0.5  # m/s, and s after it has halted
+
+
+@cache
+def footing_scene(half_width: float) -> Scene:
+    """A long footing over sand in plane strain, half as many cells wide; a node of the grid lies under its middle."""
+    (across, deep), y, half = FOOTING_BED, FOOTING_WIDTH, half_width * FOOTING
+    config = {
+        "name": "footing",
+        "plane_strain": True,
+        "box": {"lower": (-across / 2, 0, 0), "upper": (across / 2, y, 1.5 * deep)},
+        "feature": 4 * FOOTING,
+        "duration": 1.0,
+        "speed": 1.0,
+        "grains": [
+            {"material": sand(FRICTION_DEG, E), "fill": [block((-across / 2, 0, 0), (across / 2, y, deep))]},
+        ],
+        "bodies": {
+            "mjcf": f"""<mujoco><worldbody><body mocap="true" pos="0 {y / 2} {deep}">
+              <geom name="footing" type="box" pos="0 0 .1" size="{half} {y} .1"/></body></worldbody></mujoco>""",
+            "couple": ["footing"],
+            "friction": FRICTION,
+        },
+    }
+    return build(SceneConfig(**config), Fidelity(cells=4, rigid_dt=RIGID_DT))
+
+
+class Footing(NamedTuple):
+    """What a footing bears that was pressed in and then held still."""
+
+    held: float  # N
+    health: int
+    cpu_s: float
+
+
+def footing(half_width: float, depth: float) -> Footing:
+    """Press a footing in to a depth and hold it there; both in cells. The bed's surface is a plane of nodes."""
+    scene, deep = footing_scene(half_width), FOOTING_BED[1]
+
+    def pose(travel: float) -> tuple[np.ndarray, np.ndarray]:
+        return np.array([[0, FOOTING_WIDTH / 2, deep - travel]]), about_y(0)[None]
+
+    state = planted(scene, at_rest(scene, started(scene), deep), *pose(0.0))
+    goal = depth * FOOTING
+    times = RIGID_DT * np.arange(1, 1 + int((goal / PRESSED + RAMP + HELD) / RIGID_DT))
+    done = ride(scene, state, np.minimum(soft_travel(times, PRESSED, RAMP), goal), pose, 0)
+    return Footing(float(done.force[-10:, 2].mean()), int(done.last.health), done.cpu_s)
+
+
 def breakout(depth: float, friction_deg: float = FRICTION_DEG) -> float:
     """What pulls a flat square plate out from a depth (of SIDE), over the weight of sand on it.
 

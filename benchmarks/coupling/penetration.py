@@ -26,13 +26,18 @@ Band = tuple[float, float]  # the values that agree with a reference
 FRICTIONS = (20.0, 25.0, 30.0, 35.0, 40.0)  # degrees
 UEHARA, BRZINSKI, RFT = "Uehara et al. 2003", "Brzinski et al. 2013", "Li, Zhang & Goldman 2013"
 COARSE = (
-    "A body stands off sand by up to a cell, and the transfers make sand viscous, in proportion to cells too: both take"
-    " more from a shallow dent than from a deep one, and so raise the powers; see the limits"
+    "Transfers make sand viscous, in proportion to cells, which takes more from a shallow dent than from a deep one and"
+    " so raises the powers; see the limit"
 )
 VISCOUS = (
     "Transfers to the grid and back smooth velocities over a cell, so sand that shears within few cells is viscous, by"
     " about a cell squared over the substep: more with more substeps, less with smaller cells. It is not contact, for a"
     " ball made of grains meets it too"
+)
+EDGE = (
+    "A node inside a box and nearer to its side than to the face that presses, or on it, has the side's normal: sand"
+    " slips past it into the box, unless a plane of nodes lies within the contact band ahead of the face. A piston"
+    " without edges holds its load at any place"
 )
 SHALLOW = (
     "What lifts a shallow plate is the weight of the block above it, which grows with depth squared and more; what it"
@@ -72,12 +77,12 @@ def within(reference: float, share: float) -> Band:
     return reference * (1 - share), reference * (1 + share)
 
 
-def balls(cells: tuple[int, ...], band: float) -> tuple[list[Case], list[Series]]:
-    """Balls dropped at these resolutions, and what those tend to; nodes feel a ball within `band` cells."""
-    runs = {n: impact.sweep(n, band) for n in cells}
-    told = {f"{n} cells to the diameter, contact_band {band:g}": run for n, run in runs.items()}
+def balls(cells: tuple[int, ...]) -> list[Case]:
+    """Balls dropped at these resolutions, and what those tend to."""
+    runs = {n: impact.sweep(n) for n in cells}
+    told = {f"{n} cells to the diameter": run for n, run in runs.items()}
     if len(cells) > 1:
-        told[f"limit of {', '.join(map(str, cells))} cells, contact_band {band:g}"] = impact.limit(runs)
+        told[f"limit of {', '.join(map(str, cells))} cells"] = impact.limit(runs)
     out, series = [], []
     for resolution, run in told.items():
         worst = max(run.over_uehara.values(), key=lambda share: abs(np.log(share)))
@@ -90,7 +95,18 @@ def balls(cells: tuple[int, ...], band: float) -> tuple[list[Case], list[Series]
             out.append(Case(f"ball: {name}", UEHARA, reference, allowed, value, *kept))
         depth = [run.depths[h, impact.RATIOS[1]] for h in impact.HEIGHTS]
         series.append(Series(resolution, np.add(impact.HEIGHTS, depth), depth))
-    return out, series
+    fall = np.geomspace(0.08, 1.0, 20)
+    law = 0.14 / impact.REPOSE * np.sqrt(impact.RATIOS[1]) * impact.SIZE ** (2 / 3) * fall ** (1 / 3)
+    plot(
+        results.FOLDER / "penetration_balls.png",
+        f"A ball {impact.RATIOS[1]:g} times as dense as sand, {impact.SIZE:g} m across",
+        "whole fall, m",
+        "depth, m",
+        [Series(UEHARA, fall, law, joined=True), *series],
+        log=True,
+        names_below=True,
+    )
+    return out
 
 
 def one_ball(cells: int) -> list[Case]:
@@ -224,22 +240,21 @@ def blades(cells: int) -> list[Case]:
     return out
 
 
+def footings() -> list[Case]:
+    """What a footing holds where its face lies badly in the grid, over where well: with edges on nodes and between."""
+    out = []
+    for half, edges in ((4.0, "on"), (4.5, "between")):
+        badly, well = intrusion.footing(half, 1.4), intrusion.footing(half, 1.9)
+        name, resolution = f"footing, edges {edges} nodes: badly over well placed", f"{2 * half:g} cells across"
+        cost, health, even = badly.cpu_s + well.cpu_s, badly.health | well.health, badly.held / well.held
+        out.append(Case(name, "the grid is no part of it", 1, within(1, 0.1), even, resolution, cost, health, EDGE))
+    return out
+
+
 def dropped(quick: bool) -> list[Case]:
-    """Balls and cones: nodes within half a cell feel them, as users have it; and balls that only nodes inside feel."""
-    usual, series = balls((6,) if quick else (6, 8, 12), 0.5)
-    inside, more = balls((8,) if quick else (8, 12), 0.0)
-    fall = np.geomspace(0.08, 1.0, 20)
-    law = 0.14 / impact.REPOSE * np.sqrt(impact.RATIOS[1]) * impact.SIZE ** (2 / 3) * fall ** (1 / 3)
-    plot(
-        results.FOLDER / "penetration_balls.png",
-        f"A ball {impact.RATIOS[1]:g} times as dense as sand, {impact.SIZE:g} m across",
-        "whole fall, m",
-        "depth, m",
-        [Series(UEHARA, fall, law, joined=True), *series, *more],
-        log=True,
-        names_below=True,
-    )
-    return usual + inside + one_ball(6) + cones((6,) if quick else (6, 8, 12))
+    """Balls and cones."""
+    cells = (6,) if quick else (6, 8, 12)
+    return balls(cells) + one_ball(6) + cones(cells)
 
 
 def main() -> None:
@@ -255,6 +270,7 @@ def main() -> None:
         partial(walls, cells),
         partial(blades, cells),
         partial(plates, 4 if quick else 8),
+        footings,
         partial(dropped, quick),
     ):
         for case in (c.told() for c in cases()):

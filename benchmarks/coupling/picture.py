@@ -11,7 +11,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 SIZE = (640, 440)  # pixels
 EDGE = (74, 34, 20, 52)  # pixels left, above, right and below of the axes
-COLOURS = ("#1b6ca8", "#c8553d", "#3a7d44", "#8e5ea2", "#b8860b", "#555555")
+COLOURS = ("#1b6ca8", "#c8553d", "#3a7d44", "#8e5ea2", "#b8860b", "#555555", "#d1478c", "#12908e")
 INK, PALE = "#222222", "#dddddd"
 
 
