@@ -13,7 +13,8 @@ import mujoco
 import numpy as np
 from jax import Array
 
-from coupling.bodies import Bodies, distances_from, posed, refresh, start
+from coupling.bodies import Bodies, posed, refresh, start
+from coupling.reach import distances_from
 from mpm_env import native
 from mpm_env.config import nearest
 from mpm_env.fidelity import Fidelity

@@ -9,8 +9,9 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from coupling.bodies import Bodies, couple, points_near
+from coupling.bodies import Bodies, couple
 from coupling.geoms import bounding_radius, thickness
+from coupling.reach import points_near
 from mpm_env.config import nearest
 from mpm_env.fidelity import Fidelity
 from mpm_env.health import MOST_TRAVEL

@@ -37,7 +37,8 @@ FLOOR = f'<geom name="floor" type="plane" size="1 1 1" {HARD}/>'
 def bed(mjcf: str, couple: tuple[str, ...], *fills: tuple[float, float, float, float], **more: object) -> Bed:
     """A bed of 0.6 x 0.4 m with sand in these (x, x, z, z) m."""
     corners = tuple(((a, 0.0, c), (b, WIDE, d)) for a, b, c, d in fills)
-    return Bed(mjcf, couple, (0.6, WIDE, 0.4), corners, DX, 2, **more)  # type: ignore[arg-type]
+    how = {"contact_iterations": 8}  # light bodies take more than the default
+    return Bed(mjcf, couple, (0.6, WIDE, 0.4), corners, DX, 2, fidelity=how, **more)  # type: ignore[arg-type]
 
 
 @cache

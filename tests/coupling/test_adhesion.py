@@ -57,7 +57,7 @@ def sticky(adhesion: float, phase: float) -> Scene:
             "motion": {"plate": [{"t": t, "position": [0.3, WIDTH / 2, height + z]} for t, z in up]},
         },
     }
-    return build(parse(SceneConfig, config, "test"), Fidelity(cells=4, rigid_dt=DT))
+    return build(parse(SceneConfig, config, "test"), Fidelity(cells=4, rigid_dt=DT, contact_band=0.5))
 
 
 def pulled(adhesion: float, phase: float) -> tuple[float, float]:

@@ -11,8 +11,9 @@ import pytest
 from mujoco import mjx
 
 from coupling import bodies as rigid
-from coupling.bodies import Bodies, couple, points_near
+from coupling.bodies import Bodies, couple
 from coupling.constraints import settled
+from coupling.reach import points_near
 
 STEPS = 50
 FORWARD_TOLERANCE = 1e-4  # of each field's largest: the same float32 sums in another order, then a solver

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from jax import Array, lax
 
-from coupling import contact, exchange, geoms, meeting
+from coupling import constraints, contact, exchange, geoms, meeting
 from mpm_env import native
 from mpm_env.mpm.kernels import LAWS
 from mpm_env.mpm.materials import Elastic, Sand, Snow
@@ -252,7 +252,7 @@ DIGEST = """
 import hashlib, sys, jax, numpy as np
 sys.path.insert(0, {root!r})
 from tests.unit.test_native import grains, material, walk
-from coupling import contact, exchange, geoms, meeting
+from coupling import constraints, contact, exchange, geoms, meeting
 from mpm_env import native
 p = grains(3, "float32")
 after = walk(p, (material("sand", "float32"),), d=3, beds=((0, p.count),), kernels="native")
@@ -339,9 +339,11 @@ HEADERS = Path(native.__file__).parent
     ("file", "module", "names"),
     [
         ("geoms.h", geoms, ("TINY_SQUARE", "NUDGE", "FLAT_GRADIENT", "HALVINGS", "NEWTON_STEPS")),
-        ("exchange.h", exchange, ("SOLVED", "NOISE")),
+        ("constraints.h", constraints, ("SOLVED",)),
+        ("exchange.h", exchange, ("NOISE",)),
         ("exchange.h", contact, ("TINY",)),
-        ("contact.cpp", meeting, ("LEAST_NORMAL",)),
+        ("contact.cpp", meeting, ("LEAST_NORMAL", "NO_GAP", "CLOSED")),
+        ("contact.cpp", contact, ("LEAST_FILL",)),
     ],
 )
 def test_constants_of_the_kernels_are_those_of_the_reference(file: str, module: Any, names: tuple[str, ...]) -> None:
@@ -349,8 +351,8 @@ def test_constants_of_the_kernels_are_those_of_the_reference(file: str, module: 
     for name in names:
         found = re.search(rf"\b{name} = ([-+.\de]+)", text)
         assert found and float(found[1]) == getattr(module, name), name
-    steps = re.search(r"STEP\[STEPS\] = \{([^}]*)\}", (HEADERS / "exchange.h").read_text())
-    assert steps and tuple(map(float, steps[1].split(","))) == exchange.STEPS
+    steps = re.search(r"STEP\[STEPS\] = \{([^}]*)\}", (HEADERS / "constraints.h").read_text())
+    assert steps and tuple(map(float, steps[1].split(","))) == constraints.STEPS
 
 
 def test_least_b_is_one_number() -> None:

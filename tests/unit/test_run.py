@@ -19,6 +19,7 @@ from mpm_env import log, native
 from mpm_env.cli import report
 from mpm_env.config import parse
 from mpm_env.fidelity import Fidelity
+from mpm_env.health import ContactReport
 from mpm_env.ledger import Ledger
 from mpm_env.replay import compare
 from mpm_env.run import FILES, prepare, rhythm_of, run, versions
@@ -71,6 +72,7 @@ def test_time_series_have_the_promised_names_and_shapes(pushed: tuple[Path, dict
     expected: dict[str, tuple[int, ...]] = {
         **dict.fromkeys(("step", "time", "health", "mass", "mass_left"), (frames,)),
         **dict.fromkeys(("kinetic", "elastic", "potential", "bodies_kinetic", "bodies_potential"), (frames,)),
+        **dict.fromkeys((f"contact_{key}" for key in ContactReport._fields), (frames,)),
         **dict.fromkeys(("momentum", "angular_momentum", "bodies_momentum", "bodies_angular_momentum"), (frames, 3)),
         "qpos": (frames, 0),
         "qvel": (frames, 0),
