@@ -12,7 +12,8 @@ from benchmarks.coupling.scenes import RHO, G, lighter, run
 STEPS = 250  # rigid steps, a second
 CALM = 0.5  # m/s or rad/s of what is not told to move; 0.26 observed, while sand falls against the gate
 TOLD = 4.0  # rad/s of the arm, which is told to move by 2; 2.5 observed, as it meets the sand
-UNSOLVED = {"at the limit": {"NOT_CONVERGED"}}  # a substep as sand first hits the gate may stay so, and is told
+# A substep as sand first hits the gate may stay unsolved, and is told; at the wall only in the f32 sums of plain XLA.
+UNSOLVED = {"at the limit": {"NOT_CONVERGED"}, "at the wall": {"NOT_CONVERGED"}}
 NOISE = 0.1  # of the mean force; 0.04 observed, under the buried box
 AGREEMENT = 0.01  # cells that MJX's step may end apart from where the grains saw it; 1.3e-3 observed, at the wall
 UNPAID = 1e-6  # of the exchanged impulse, float32; 5e-8 observed
