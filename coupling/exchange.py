@@ -77,7 +77,8 @@ def exchange(
         return jnp.sum(jnp.einsum("cik,cjk->cij", f, lever), axis=0)
 
     zero, rows = jnp.zeros_like(q_free), t.rows
-    q_held, stuck_mass = q_free, t.M + pull(p.m * lever)
+    points_mass = pull(p.m * lever)
+    q_held, stuck_mass = q_free, t.M + points_mass
     if rows:  # what they do without the points
         held = settled(t.M, rows, q_free, zero, zero)
         q_held = q_free + held.change
@@ -131,8 +132,7 @@ def exchange(
 
     all_stick = pull((p.m * w_free)[:, None])[0]
     if rows:
-        points = pull(p.m * lever)
-        at = better(none, among([held_step(zero, points, -all_stick, 1.0)]))
+        at = better(none, among([held_step(zero, points_mass, -all_stick, 1.0)]))
     else:
         at = nearer(none, metric @ all_stick, jnp.ones((1,), all_stick.dtype))
     at = at._replace(going=at.size > enough)

@@ -13,7 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks.coupling.scenes import STRIDE, Bed, run, settled, trouble
+from benchmarks.coupling.beds import ROWS
+from benchmarks.coupling.scenes import Bed, run, settled, trouble
 from mpm_env import State
 from mpm_env.sim import Drive
 
@@ -68,17 +69,12 @@ class Drag(NamedTuple):
         """Mean force between two places, m."""
         return float(self.force[(self.way > first) & (self.way <= last)].mean())
 
-    def smooth(self, width: float) -> np.ndarray:
-        """The force (k,) averaged over a way of this width (m): node crossings are as long as a cell."""
-        cells = max(1, round(width / (SPEED * DT)))
-        return np.convolve(self.force, np.ones(cells) / cells, "valid")
-
 
 def dragged(some: Bed, way: float) -> Drag:
     """Drive the blade this far (m), through a bed at rest."""
     scene, state = some.scene(), settled(some.scene(), some.start(), 2)
     pos, quat = (np.asarray(a) for a in (state.rigid.mocap_pos, state.rigid.mocap_quat))
-    count = STRIDE * int(np.ceil((way / SPEED + RAMP / 2) / DT / STRIDE))
+    count = ROWS * int(np.ceil((way / SPEED + RAMP / 2) / DT / ROWS))
     gone = travelled((np.arange(count) + 1) * DT)
     positions = pos[None] + gone[:, None, None] * np.eye(3)[0]
     drives = Drive(jnp.zeros((count, 0)), jnp.asarray(positions, pos.dtype), jnp.asarray(np.tile(quat, (count, 1, 1))))

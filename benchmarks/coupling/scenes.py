@@ -16,18 +16,15 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from benchmarks.coupling.beds import RHO, ROWS, G, started, with_sand
 from coupling import bodies as rigid
-from mpm_env import Fidelity, Scene, SceneConfig, State, build, initial, scripted
+from mpm_env import Fidelity, Scene, SceneConfig, State, build, scripted
 from mpm_env.config import parse
 from mpm_env.health import ContactReport, names
 from mpm_env.mpm.budgets import budgets
 from mpm_env.sim import Drive, rigid_step
 
-G = 9.81  # m/s^2
-RHO = 1500.0  # kg/m^3
 SAND = {"model": "sand", "E": 1e6, "nu": 0.3, "rho": RHO, "friction_deg": 35.0}
-
-STRIDE = 25  # rigid steps in one call
 
 Vec = tuple[float, float, float]
 
@@ -75,10 +72,9 @@ class Bed:
         how = {"dimension": self.dimension, "cells": cells, "rigid_dt": self.rigid_dt} | self.fidelity
         return build(parse(SceneConfig, config, "bed"), Fidelity(**how))
 
-    @cache  # noqa: B019
     def start(self) -> State:
         """Grains as seeded, bodies as in the model."""
-        return jax.jit(partial(initial, self.scene()))(jax.random.key(0))
+        return started(self.scene())
 
 
 class Steps(NamedTuple):
@@ -89,7 +85,6 @@ class Steps(NamedTuple):
     reaction: np.ndarray  # (k, G, 6) N and N m, mean over the step
     contact: ContactReport  # (k,) each
     grains: np.ndarray  # (k,) J, kinetic, elastic and potential energy
-    momentum: np.ndarray  # (k, d) kg m/s, of the grains
     health: np.ndarray  # (k,) sticky bits
 
 
@@ -102,19 +97,17 @@ def _program(scene: Scene) -> Any:
         b = budgets(scene.grid, scene.beds(state.materials), state.grains, gravity)
         d = state.rigid
         energy = b.kinetic + b.elastic + b.potential
-        return state, Steps(d.qpos, d.qvel, state.reaction, state.contact, energy, b.momentum, state.health)
+        return state, Steps(d.qpos, d.qvel, state.reaction, state.contact, energy, state.health)
 
     return jax.jit(lambda state, drives: jax.lax.scan(one, state, drives))
 
 
 def run(scene: Scene, state: State, count: int, drives: Drive | None = None) -> tuple[State, Steps]:
-    """So many rigid steps, up to STRIDE more, by the scene's own motion, or by these drives (count, ..)."""
+    """So many rigid steps, up to ROWS more, by the scene's own motion, or by these drives (count, ..)."""
     parts, first = [], int(state.steps)
-    for k in range(0, count, STRIDE):  # in equal calls, so that a scene compiles once
+    for k in range(0, count, ROWS):  # in equal calls, so that a scene compiles once
         some = (
-            scripted(scene, first + k, STRIDE)
-            if drives is None
-            else jax.tree.map(lambda a, k=k: a[k : k + STRIDE], drives)
+            scripted(scene, first + k, ROWS) if drives is None else jax.tree.map(lambda a, k=k: a[k : k + ROWS], drives)
         )
         state, steps = _program(scene)(state, some)
         parts.append(jax.tree.map(partial(np.asarray, dtype=np.float64), steps))
@@ -125,18 +118,15 @@ def settled(scene: Scene, state: State, rounds: int = 4) -> State:
     """The state with its grains come to rest, by taking all speed out of them now and then; bodies stay in place."""
     there = state.rigid
     for _ in range(rounds):
-        state, _ = run(scene, state, STRIDE)
+        state, _ = run(scene, state, ROWS)
         still = replace(state.grains, v=0 * state.grains.v, C=0 * state.grains.C)
         state = replace(state, grains=still, rigid=there)
     return replace(state, steps=0 * state.steps)
 
 
-def lighter(state: State, ratio: float, **material: float) -> State:
+def lighter(state: State, ratio: float) -> State:
     """The state with sand over `ratio` times as dense and stiff: bodies of sand's density are as light as that."""
-    (sand,) = state.materials
-    sand = replace(sand, rho=sand.rho / ratio, E=sand.E / ratio)
-    sand = replace(sand, **{k: jnp.full_like(getattr(sand, k), v) for k, v in material.items()})
-    return replace(state, materials=(sand,), grains=replace(state.grains, m=state.grains.m / ratio))
+    return with_sand(state, denser=1 / ratio)
 
 
 def shifted(

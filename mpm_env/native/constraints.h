@@ -35,6 +35,13 @@ inline void solve(Vector& A, Vector& B, int n, int columns) {
     }
 }
 
+inline Vector inverse(Vector A, int n) {
+  Vector B(n * n, 0);
+  for (int i = 0; i < n; ++i) B[i * n + i] = 1;
+  solve(A, B, n, n);
+  return B;
+}
+
 inline Vector times(const Vector& A, const Vector& x) {
   const size_t n = x.size();
   Vector y(n, 0);
@@ -100,13 +107,10 @@ struct Constraints {
   }
 
   // The change c of joint velocities q for which M c = load + J^T (p(q + c) - given), from a guess of it.
-  // What remains is measured in the metric, by default the inverse of M.
-  Settled settled(const Vector& M, const Vector& q, const Vector& load, const Vector& guess, double rounding,
-                  const Vector* own_metric = nullptr) const {
-    Vector metric(nv * nv, 0), H(M), c(guess), at(nv), step(nv), held(nv, 0), all(nv, 0), tried(nv);
-    for (int a = 0; a < nv; ++a) metric[a * nv + a] = 1;
-    if (own_metric) metric = *own_metric;
-    else solve(H, metric, nv, nv);
+  // What remains is measured in the metric.
+  Settled settled(const Vector& M, const Vector& metric, const Vector& q, const Vector& load, const Vector& guess,
+                  double rounding) const {
+    Vector H(M), c(guess), at(nv), step(nv), held(nv, 0), all(nv, 0), tried(nv);
     auto remains = [&](const Vector& c) {
       for (int a = 0; a < nv; ++a) at[a] = q[a] + c[a];
       Vector R = times(M, c);

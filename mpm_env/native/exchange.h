@@ -82,7 +82,8 @@ Outcome exchange(Crowd<S>& crowd, const Vector& M, const Constraints& rows, cons
   out.given = rows.given;
   const bool constrained = nv && rows.count;
   Settled held{out.change, out.given, 0};
-  if (constrained) held = rows.settled(M, q, Vector(nv, 0), Vector(nv, 0), rounding);
+  const Vector mobility = constrained ? inverse(M, nv) : Vector();
+  if (constrained) held = rows.settled(M, mobility, q, Vector(nv, 0), Vector(nv, 0), rounding);
   if (nv == 0 || packs == 0) { out.change = held.change; out.given = held.given; out.residual = held.left; return out; }
   Vector q_held(q);
   if (constrained) {
@@ -99,7 +100,7 @@ Outcome exchange(Crowd<S>& crowd, const Vector& M, const Constraints& rows, cons
   for (int k = 0; k < packs; ++k) for (int i = 0; i < 3; ++i) free[3 * k + i] = crowd.of(k)[SPEED + i];
 
   // metric = (M + J^T m J)^-1, and what the bodies would get if all points stuck to them
-  Vector metric(nv * nv, 0), stick(nv, 0), H(M);
+  Vector stick(nv, 0), H(M);
   for (int a = 0; a < nv * nv; ++a) sum[a] = Pack<S>(S(0));
   std::vector<Pack<S>> stuck(nv, Pack<S>(S(0)));
   for (int k = 0; k < packs; ++k) {
@@ -116,7 +117,6 @@ Outcome exchange(Crowd<S>& crowd, const Vector& M, const Constraints& rows, cons
   }
   Vector points_mass(nv * nv);
   for (int a = 0; a < nv; ++a) {
-    metric[a * nv + a] = 1;
     stick[a] = total(stuck[a]);
     for (int b = 0; b <= a; ++b) points_mass[a * nv + b] = points_mass[b * nv + a] = total(sum[a * nv + b]);
   }
@@ -125,8 +125,7 @@ Outcome exchange(Crowd<S>& crowd, const Vector& M, const Constraints& rows, cons
     if (held.given[i] > rows.low[i] && held.given[i] < rows.high[i])
       for (int a = 0; a < nv; ++a)
         for (int b = 0; b < nv; ++b) H[a * nv + b] += rows.D[i] * rows.J[i * nv + a] * rows.J[i * nv + b];
-  const Vector stuck_mass(H);
-  solve(H, metric, nv, nv);
+  const Vector stuck_mass(H), metric = inverse(stuck_mass, nv);
 
   // The equation's remainder for a change of q, and its size in the metric.
   Vector moved_q(nv);
@@ -138,36 +137,44 @@ Outcome exchange(Crowd<S>& crowd, const Vector& M, const Constraints& rows, cons
   };
 
   Vector change(nv, 0), R(nv), tried(nv), R_tried(nv), best_change(nv), best_R(nv);
-  // The best of some changes of q, if it helps; sets what remains then. Returns whether it did.
   double size = 0;
+  // Adds to the j-th pulls what points of a pack pull that move with w.
+  auto pull = [&](int j, const Pack<S>* p, const Rows<S>& w) {
+    Rows<S> f;
+    impulses<S>(p, w, f);
+    for (int a = 0; a < nv; ++a) {
+      const Pack<S>* A = p + LEVER + 3 * a;
+      sum[j * nv + a] = sum[j * nv + a] + f[0] * A[0] + f[1] * A[1] + f[2] * A[2];
+    }
+  };
+  // The best of some changes of q, which propose(j) puts into `tried`, by their pulls: becomes `change` if it helps.
+  // Returns which, or -1.
+  auto choose = [&](int count, auto propose) {
+    int best = -1;
+    double least = 0;
+    for (int j = 0; j < count; ++j) {
+      propose(j);
+      const double s = left_over(tried, sum + j * nv, R_tried);
+      if (best < 0 || !(s >= least)) { best = j; least = s; best_change = tried; best_R = R_tried; }
+    }
+    if (!(least < size)) return -1;
+    change = best_change; R = best_R; size = least;
+    return best;
+  };
+  // Goes to the best of some changes of q, if it helps. Returns whether it did.
   auto nearest_of = [&](const Vector* changes, int count) {
     for (int j = 0; j < count * nv; ++j) sum[j] = Pack<S>(S(0));
     std::vector<S> further(size_t(count) * nv);
     for (int j = 0; j < count; ++j) for (int a = 0; a < nv; ++a) further[j * nv + a] = S(changes[j][a] - change[a]);
-    for (int k = 0; k < packs; ++k) {
-      const Pack<S>*p = crowd.of(k), *lever = p + LEVER;
-      for (int j = 0; j < count; ++j) {
-        Rows<S> w = {p[SPEED], p[SPEED + 1], p[SPEED + 2]}, f;
-        for (int a = 0; a < nv; ++a) for (int i = 0; i < 3; ++i) w[i] = w[i] - further[j * nv + a] * lever[3 * a + i];
-        impulses<S>(p, w, f);
-        for (int a = 0; a < nv; ++a) {
-          const Pack<S>* A = lever + 3 * a;
-          sum[j * nv + a] = sum[j * nv + a] + f[0] * A[0] + f[1] * A[1] + f[2] * A[2];
-        }
-      }
-    }
-    int best = -1;
-    double least = 0;
-    for (int j = 0; j < count; ++j) {
-      const double s = left_over(changes[j], sum + j * nv, R_tried);
-      if (best < 0 || !(s >= least)) { best = j; least = s; best_R = R_tried; }
-    }
-    if (!(least < size)) return false;
-    for (int k = 0; k < packs; ++k) {
-      Pack<S>*p = crowd.of(k), *lever = p + LEVER;
-      for (int a = 0; a < nv; ++a) for (int i = 0; i < 3; ++i) p[SPEED + i] = p[SPEED + i] - further[best * nv + a] * lever[3 * a + i];
-    }
-    change = changes[best]; R = best_R; size = least;
+    auto further_on = [&](const Pack<S>* p, int j, Rows<S>& w) {
+      for (int i = 0; i < 3; ++i) w[i] = p[SPEED + i];
+      for (int a = 0; a < nv; ++a) for (int i = 0; i < 3; ++i) w[i] = w[i] - further[j * nv + a] * p[LEVER + 3 * a + i];
+    };
+    Rows<S> w;
+    for (int k = 0; k < packs; ++k) for (int j = 0; j < count; ++j) { further_on(crowd.of(k), j, w); pull(j, crowd.of(k), w); }
+    const int best = choose(count, [&](int j) { tried = changes[j]; });
+    if (best < 0) return false;
+    for (int k = 0; k < packs; ++k) { further_on(crowd.of(k), best, w); for (int i = 0; i < 3; ++i) crowd.of(k)[SPEED + i] = w[i]; }
     return true;
   };
   // The same among some shares of a step.
@@ -179,24 +186,13 @@ Outcome exchange(Crowd<S>& crowd, const Vector& M, const Constraints& rows, cons
       for (int a = 0; a < nv; ++a) for (int i = 0; i < 3; ++i) dw[i] = dw[i] + S(step[a]) * lever[3 * a + i];
       for (int i = 0; i < 3; ++i) moved[3 * k + i] = dw[i];
       for (int j = 0; j < shares; ++j) {
-        Rows<S> w, f;
+        Rows<S> w;
         for (int i = 0; i < 3; ++i) w[i] = p[SPEED + i] - S(STEP[j]) * dw[i];
-        impulses<S>(p, w, f);
-        for (int a = 0; a < nv; ++a) {
-          const Pack<S>* A = lever + 3 * a;
-          sum[j * nv + a] = sum[j * nv + a] + f[0] * A[0] + f[1] * A[1] + f[2] * A[2];
-        }
+        pull(j, p, w);
       }
     }
-    int best = -1;
-    double least = 0;
-    for (int j = 0; j < shares; ++j) {
-      for (int a = 0; a < nv; ++a) tried[a] = change[a] + STEP[j] * step[a];
-      const double s = left_over(tried, sum + j * nv, R_tried);
-      if (best < 0 || !(s >= least)) { best = j; least = s; best_change = tried; best_R = R_tried; }
-    }
-    if (!(least < size)) return false;
-    change = best_change; R = best_R; size = least;
+    const int best = choose(shares, [&](int j) { for (int a = 0; a < nv; ++a) tried[a] = change[a] + STEP[j] * step[a]; });
+    if (best < 0) return false;
     for (int k = 0; k < packs; ++k)
       for (int i = 0; i < 3; ++i) crowd.of(k)[SPEED + i] = crowd.of(k)[SPEED + i] - S(STEP[best]) * moved[3 * k + i];
     return true;
@@ -210,7 +206,7 @@ Outcome exchange(Crowd<S>& crowd, const Vector& M, const Constraints& rows, cons
     for (int j = 0; j < nv * nv; ++j) { A[j] += (1 / share - 1) * stuck_mass[j]; whole[j] += A[j]; }
     Vector load = times(A, change);
     for (int a = 0; a < nv; ++a) load[a] -= pulled[a];
-    return later.settled(whole, q_held, load, change, rounding, &metric).change;
+    return later.settled(whole, metric, q_held, load, change, rounding).change;
   };
 
   size = std::numeric_limits<double>::infinity();
@@ -276,7 +272,7 @@ Outcome exchange(Crowd<S>& crowd, const Vector& M, const Constraints& rows, cons
   if (constrained) {
     Vector load(nv), guess(nv);
     for (int a = 0; a < nv; ++a) { load[a] = -pulled[a]; guess[a] = held.change[a] + change[a]; }
-    const Settled whole = rows.settled(M, q, load, guess, rounding);
+    const Settled whole = rows.settled(M, mobility, q, load, guess, rounding);
     for (int a = 0; a < nv; ++a) push[a] = held.change[a] - whole.change[a];
   } else {
     H = M;
@@ -288,7 +284,7 @@ Outcome exchange(Crowd<S>& crowd, const Vector& M, const Constraints& rows, cons
   if (std::abs(work) > noise && doubled > 0) out.scale = std::min(std::max(-work / doubled, 0.0), 1.0);
   for (int a = 0; a < nv; ++a) { out.change[a] = held.change[a] - out.scale * push[a]; pulled[a] *= -out.scale; }
   if (constrained) {
-    const Settled done = rows.settled(M, q, pulled, out.change, rounding);
+    const Settled done = rows.settled(M, mobility, q, pulled, out.change, rounding);
     out.change = done.change;
     out.given = done.given;
     out.residual = std::max({out.residual, held.left, done.left});

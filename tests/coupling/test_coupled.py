@@ -14,9 +14,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from coupling import meeting
-from coupling.contact import Points, Surface
-from coupling.exchange import Exchange, Twists, exchange
+from benchmarks.coupling.tell_apart import control, explicit
 from mpm_env import sim
 from mpm_env.config import parse
 from mpm_env.fidelity import Fidelity
@@ -296,20 +294,11 @@ def test_a_light_box_lies_still_in_sand() -> None:
     assert int(states[-1].health) == Health.WELL
 
 
-def test_explicit_contact_would_throw_the_light_box_out(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_explicit_contact_would_throw_the_light_box_out() -> None:
     """Negative control: the same scene, law and momentum, but impulses at the velocity without contact."""
-
-    def explicit(
-        p: Points, t: Twists, q_free: jax.Array, surface: Surface, body_of: tuple[int, ...], _: int
-    ) -> Exchange:
-        as_told = t._replace(J=t.J[:, :, :0], M=t.M[:0, :0], d=t.J @ q_free + t.d)
-        done = exchange(p, as_told, q_free[:0], surface, body_of, 0)
-        pull = jnp.einsum("gkn,gk->n", t.J[np.asarray(body_of)], done.wrench)
-        return done._replace(q=q_free + jnp.linalg.solve(t.M, pull))
-
-    monkeypatch.setattr(meeting, "exchange", explicit)
     scene = replace(buried(), kernels="xla")
-    thrown, _ = jax.jit(partial(sim.advance, scene))(light(), sim.scripted(scene, 0, ROWS))
+    with control(explicit):
+        thrown, _ = jax.jit(partial(sim.advance, scene))(light(), sim.scripted(scene, 0, ROWS))
     assert not fastest([thrown]) < 100 * CALM  # or not a number
 
 
