@@ -117,7 +117,8 @@ def _around(mask: np.ndarray, reach: int) -> np.ndarray:
     """Nodes at most so many voxels along each axis from one that the mask (nodes) holds."""
     for axis in range(mask.ndim):
         sides = [(reach, reach) if other == axis else (0, 0) for other in range(mask.ndim)]
-        mask = np.lib.stride_tricks.sliding_window_view(np.pad(mask, sides), 2 * reach + 1, axis).any(axis=-1)
+        windows = np.lib.stride_tricks.sliding_window_view(np.pad(mask, sides), 2 * reach + 1, axis)
+        mask = np.any(windows, axis=-1, keepdims=True)[..., 0]
     return mask
 
 
