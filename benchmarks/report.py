@@ -53,8 +53,14 @@ def throughput(r: dict[str, Any]) -> str:
     head = ["kernels", "ns per grain and substep", "fixed us per substep", "exponent", "bytes per grain", "MB besides"]
     text += "Straight lines through time and peak memory against grains; an exponent of 1 is linear.\n\n"
     text += table(head, rows)
+    again = "".join(f"Sweep taken again at {commit}: {sweep}.\n" for sweep, commit in r.get("retaken", {}).items())
     same = ", ".join(f"{name}: {100 * value:.2g} %" for name, value in r["same_job"].items())
-    return text + f"\nLargest difference of r99, z99 and zcom at t = 0.1 s from the C++ code's: {same}.\n"
+    return (
+        again
+        + ("\n" if again else "")
+        + text
+        + f"\nLargest difference of r99, z99 and zcom at t = 0.1 s from the C++ code's: {same}.\n"
+    )
 
 
 def compare(r: dict[str, Any]) -> str:

@@ -152,14 +152,15 @@ def rigid(run: Run) -> dict[str, Stage]:
 
     def mjx(p: Particles, now: tuple[Any, bodies.Stance]) -> tuple[Particles, tuple[Any, bodies.Stance]]:
         d, stance = opened(now[0])
-        d = bodies.close_step(b, d, state.rigid.qfrc_applied * scene.rigid_dt)
+        d = bodies.close_step(b, d, state.rigid.qfrc_applied * scene.rigid_dt, bodies.foreseen(b, stance, d.qvel))
         return p, (bodies.refresh(b, bodies.place(d, drive.position, drive.quaternion)), stance)
 
     def lookup(p: Particles, stance: bodies.Stance) -> tuple[Array, ...]:
         return tuple(Contact.of(scene, stance, p))[2:]
 
     def health(p: Particles, touch: Touch) -> tuple[Array, Array]:
-        after = sim._examined(scene, state, replace(state, grains=p), contact.examined(touch))
+        examined = contact.examined(touch, contact.report(touch, touch.q))
+        after = sim._examined(scene, state, replace(state, grains=p), examined)
         return after.health, after.left
 
     d, stance = jax.jit(opened)(state.rigid)

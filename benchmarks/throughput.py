@@ -1,6 +1,6 @@
 """How fast the column runs, over size, dimension, material, precision, kernels, batch and cores.
 
-    python -m benchmarks.throughput [--quick]
+    python -m benchmarks.throughput [--quick] [--only SWEEP ...]
 
 Million grain-substeps per CPU second on one core, unless said. Each variant is a process of its own, so that its memory
 is known. The variants of a sweep take turns, one sweep after the other, so that those that are compared run within a
@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks import job, results
+from benchmarks import job, machine, results
 from benchmarks.clock import significant
 from benchmarks.column import kernels_here
 from benchmarks.compare import in_rounds
@@ -88,13 +88,25 @@ def same_job(row: dict[str, Any]) -> float:
     return max(abs(row[key] / value - 1) for key, value in HEAPS[row["n"]].items())
 
 
+def merged(kept: dict[str, Any], rows: dict[str, Any], commit: str) -> dict[str, Any]:
+    """Kept results with some sweeps (name -> kernels -> variant) taken again at this commit."""
+    retaken = kept.get("retaken", {}) | dict.fromkeys(rows, commit)
+    return kept | {"sweeps": kept["sweeps"] | rows, "retaken": retaken}
+
+
 def main() -> None:
     """Run every variant and write results/throughput.json."""
     parser = argparse.ArgumentParser(description="Throughput of the column over its variants.")
     parser.add_argument("--quick", action="store_true", help="fewer variants, one round")
+    parser.add_argument("--only", nargs="+", metavar="SWEEP", help="take these again and keep the others' results")
     a = parser.parse_args()
     own = [sys.executable, "-m", "benchmarks.column"]
     wanted = sweeps(a.quick)
+    kept = results.read("throughput")
+    if unknown := set(a.only or ()) - set(wanted):
+        parser.error(f"there is no sweep {', '.join(sorted(unknown))}: use {', '.join(wanted)}")
+    if a.only and (kept is None or kept["quick"] != a.quick):
+        parser.error("there are no results to keep of a run as long as this: run all sweeps")
     heaps = {f"--n {n}": ["--n", str(n), "--tend", "0.1"] for n in (HEAPS if not a.quick else (10,))}
     kinds, missing = kernels_here()
     rows: dict[str, Any] = {}
@@ -109,9 +121,11 @@ def main() -> None:
 
     with tempfile.TemporaryDirectory() as cache:  # so that a variant is compiled once, not in each round
         setting = {"JAX_COMPILATION_CACHE_DIR": cache, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
-        for sweep, variants in wanted.items():
-            rows[sweep] = run(variants, 1 if a.quick else ROUNDS)
-        heaped = run(heaps, 1)
+        for sweep in a.only or wanted:
+            rows[sweep] = run(wanted[sweep], 1 if a.quick else ROUNDS)
+        heaped = {} if a.only else run(heaps, 1)
+    if a.only and kept:
+        return results.write("throughput", merged(kept, rows, machine.commit()))
     content = {
         "quick": a.quick,
         "sweeps": rows,

@@ -13,7 +13,8 @@ import pytest
 
 from benchmarks import box, report, stages
 from benchmarks.clock import in_turns, spread
-from benchmarks.throughput import HEAPS, fit, same_job
+from benchmarks.coupled import DIG_STEPS, Run, digging
+from benchmarks.throughput import HEAPS, fit, merged, same_job
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 
@@ -36,6 +37,15 @@ def test_same_job_is_the_worst_of_the_heap_s_numbers() -> None:
     row = {"n": 10} | HEAPS[10]
     assert same_job(row) == 0
     assert same_job(row | {"zcom": 1.01 * HEAPS[10]["zcom"]}) == pytest.approx(0.01)
+
+
+def test_sweeps_taken_again_stand_in_for_the_kept_ones_and_say_so() -> None:
+    kept = {"sweeps": {"size": {"native": 1}, "batch": {"native": 2}}, "retaken": {"size": "old"}}
+    done = merged(kept, {"batch": {"native": 3}}, "new")
+    assert done == {
+        "sweeps": {"size": {"native": 1}, "batch": {"native": 3}},
+        "retaken": {"size": "old", "batch": "new"},
+    }
 
 
 @pytest.mark.parametrize(("late", "settled"), [(0.0, True), (0.1, False)])
@@ -85,6 +95,14 @@ def test_goal_for_bodies_is_that_of_standard_fidelity(monkeypatch: pytest.Monkey
 def test_report_needs_no_results(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(report.results, "FOLDER", tmp_path)
     assert "| - |" in report.goals()
+
+
+@pytest.mark.slow
+def test_stages_of_a_rigid_step_are_those_of_today_s_code(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They call the package's inner functions, so they are traced here, though not run."""
+    monkeypatch.setattr(stages, "repeated", lambda stage, start: jax.eval_shape(stage, start))
+    run = Run(digging("auto", "draft"), DIG_STEPS)
+    assert {*stages.rigid(run)} == {"whole", "grains", *stages.PER_SUBSTEP, "lookup", "MJX", "health check"}
 
 
 @pytest.mark.slow
