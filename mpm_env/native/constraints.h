@@ -60,20 +60,27 @@ inline double length(const Vector& metric, const Vector& R) {
 struct Settled { Vector change, given; double left; };
 
 struct Constraints {
-  int count, nv;
+  int count = 0, nv;
   Vector J, T, D, aim, low, high, given, into;  // see Rows in constraints.py; into = J T
+  std::vector<int> row;  // which of all these are
 
-  Constraints(int count, int nv) : count(count), nv(nv) {}
+  explicit Constraints(int nv) : nv(nv) {}
 
-  template <class S> void read(const S* rows_J, const S* rows_T, const S* law) {
+  // Takes those of all rows that push along some joint: of limits and contacts that are far, MJX leaves zeros.
+  template <class S> void read(int all, const S* rows_J, const S* rows_T, const S* law) {
+    for (int i = 0; i < all; ++i)
+      if (std::any_of(rows_J + i * nv, rows_J + (i + 1) * nv, [](S j) { return j != 0; })) row.push_back(i);
+    count = int(row.size());
     if (count == 0) return;
-    J.assign(rows_J, rows_J + count * nv);
     T.assign(rows_T, rows_T + nv * nv);
     into.assign(count * nv, 0);
+    Vector* of[] = {&D, &aim, &low, &high, &given};
+    for (int i : row) {
+      J.insert(J.end(), rows_J + i * nv, rows_J + (i + 1) * nv);
+      for (int k = 0; k < 5; ++k) of[k]->push_back(law[k * all + i]);
+    }
     for (int i = 0; i < count; ++i)
       for (int a = 0; a < nv; ++a) for (int b = 0; b < nv; ++b) into[i * nv + b] += J[i * nv + a] * T[a * nv + b];
-    Vector* of[] = {&D, &aim, &low, &high, &given};
-    for (int k = 0; k < 5; ++k) of[k]->assign(law + k * count, law + (k + 1) * count);
   }
 
   // What row i would give without its bounds, when joints move with q.

@@ -145,11 +145,15 @@ template <class S> void run(const Meet& t, int64_t b) {
     mine[SLACK * W] = std::max(gap, S(0)) * S(CLOSED / t.dt);
   }
 
-  Constraints rows{int(t.rows), int(nv)};
-  rows.read(t.rows_J.of<S>(b), t.rows_T.of<S>(b), t.rows_law.of<S>(b));
+  Constraints rows{int(nv)};
+  const S* law = t.rows_law.of<S>(b);
+  rows.read(int(t.rows), t.rows_J.of<S>(b), t.rows_T.of<S>(b), law);
   const Outcome done = exchange<S>(crowd, Vector(M, M + nv * nv), rows, Vector(q_free, q_free + nv), energy, int(t.iterations));
   for (int64_t j = 0; j < nv; ++j) ((S*)t.q)[b * nv + j] = S(q_free[j] + done.change[j]);
-  for (int64_t j = 0; j < t.rows; ++j) ((S*)t.given)[b * t.rows + j] = S(done.given[j]);
+  S* given = (S*)t.given + b * t.rows;
+  for (int64_t j = 0; j < t.rows; ++j)  // what rows give that push nothing is their law alone
+    given[j] = std::min(std::max(law[j] * law[t.rows + j], law[2 * t.rows + j]), law[3 * t.rows + j]);
+  for (int j = 0; j < rows.count; ++j) given[rows.row[j]] = S(done.given[j]);
   ((S*)t.residual)[b] = S(done.residual);
   ((S*)t.scale)[b] = S(done.scale);
 

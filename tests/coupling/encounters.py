@@ -16,6 +16,7 @@ from coupling.constraints import Rows
 from coupling.exchange import Twists
 from coupling.geoms import Shape, Voxels
 from coupling.meeting import Geoms, Meeting, Surfaces, meet, near
+from mpm_env import native
 
 
 class Case(NamedTuple):
@@ -56,6 +57,8 @@ def program(g: Geoms, reach: float, how: str) -> Any:
 
 def met(g: Geoms, case: Case, reach: float, dtype: str, how: str = "one") -> Meeting:
     """How points meet bodies in this precision, back as float64; a batch of cases at once, or one by one in a map."""
+    if g.kernels == "native":
+        assert native.why_not() is None  # and so they are loaded
     with jax.enable_x64(dtype == "float64"):
         cast = jax.tree.map(lambda a: jnp.asarray(a, dtype), case)
         return jax.tree.map(lambda a: np.asarray(a, np.float64), program(g, reach, how)(cast))
@@ -177,6 +180,8 @@ def _looking(g: Geoms, low: float, room: int) -> Any:
 
 def looked_up(g: Geoms, case: Case, low: float, high: np.ndarray, room: int, dtype: str) -> tuple[np.ndarray, bool]:
     """What `near` finds in this precision."""
+    if g.kernels == "native":
+        assert native.why_not() is None  # and so they are loaded
     with jax.enable_x64(dtype == "float64"):
         cast = (jnp.asarray(a, dtype) for a in (case.pos, case.mat, case.x, high))
         index, over = _looking(g, low, room)(*cast)

@@ -17,12 +17,13 @@ DEEPEST = 0.25  # cells
 REBOUND = {0.01: 0.05, 0.1: 0.1, 1.0: 0.4}
 REST = 0.5  # cells above the sand's surface, or below it; 0.16 to 0.29 observed
 SCATTER = 0.2  # cells, between places of the surface in its cell; 0.06 to 0.09 observed, 0.75 where nodes tell no gaps
+CONVERGES = 0.8  # of the gap in m, when cells are halved
 PHASES = (0.0, 0.25, 0.5, 0.75)
 
 
 @cache
-def done(ratio: float, phase: float = 0.0) -> Drop:
-    return dropped(drop(2, DX, phase=phase), ratio, SECONDS)[0]
+def done(ratio: float, phase: float = 0.0, dx: float = DX, dimension: int = 2) -> Drop:
+    return dropped(drop(dimension, dx, phase=phase), ratio, SECONDS)[0]
 
 
 @pytest.mark.parametrize("ratio", RATIOS)
@@ -46,3 +47,24 @@ def test_a_dropped_box_comes_to_rest_on_the_surface_and_weighs_itself(ratio: flo
 def test_where_a_box_rests_hardly_depends_on_where_the_grid_lies(ratio: float) -> None:
     gaps = [done(ratio, phase).gap for phase in PHASES]
     assert max(gaps) - min(gaps) < SCATTER
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ratio", [0.1, 1.0])
+def test_where_a_box_rests_converges_with_the_cell_size(ratio: float) -> None:
+    """In metres: its gap to the surface is a part of a cell."""
+    assert abs(done(ratio, dx=DX / 2).gap) * DX / 2 < CONVERGES * abs(done(ratio).gap) * DX
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ratio", RATIOS)
+def test_a_box_dropped_in_space_does_as_one_in_plane_strain(ratio: float) -> None:
+    box = done(ratio, dimension=3)
+    assert box.rise < RISE
+    assert box.depth < DEEPEST
+    assert set(box.trouble) <= TOLD.get(ratio, set())
+    if ratio in REBOUND:
+        assert box.up < REBOUND[ratio] * box.impact
+        assert box.rms < CALM[ratio]
+        assert box.weight == pytest.approx(1, rel=WEIGHT_TOLERANCE)
+        assert abs(box.gap) < REST
