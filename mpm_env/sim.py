@@ -74,6 +74,8 @@ def rigid_step(scene: Scene, state: State, drive: Drive) -> State:
     foreseen = rigid.foreseen(b, stance, touch.q.astype(dtype)) if b.steps else None
     d = rigid.close_step(b, d, touch.impulse.astype(dtype), foreseen)
     d = rigid.refresh(b, rigid.place(d, drive.position, drive.quaternion))
+    # Under 64-bit JAX, MJX's contacts come back with wider integers than they went in.
+    d = jax.tree.map(lambda new, old: new.astype(old.dtype), d, state.rigid)
     report = contact.report(touch, d.qvel.astype(scene.dtype))
     after = replace(
         state,

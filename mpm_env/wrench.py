@@ -34,7 +34,7 @@ def wrench_at(
     known = [b.model.site(i).name for i in range(b.model.nsite)] if b else []
     if b is None or site not in known:
         raise ValueError(f"The model has no site {site!r}{nearest(site, known)}")
-    model, d, at = b.model, state.rigid, b.model.site(site)
+    model, d, at, reaction = b.model, state.rigid, b.model.site(site), jnp.asarray(reaction)
     carrier = model.geom_bodyid[np.asarray(b.geoms)]
     mine = np.flatnonzero(model.body_weldid[carrier] == model.body_weldid[at.bodyid[0]])
     lever = (d.xipos[carrier[mine]] - d.site_xpos[at.id]).astype(reaction.dtype)

@@ -27,13 +27,13 @@ LIMIT = 0.15  # rad, of the gate
 HARD = 'solimp=".9999 .9999 .001"'
 
 UNPAID = {"f32": 1e-6, "f64": 1e-14}  # of the impulse exchanged in a rigid step; 9e-8 and 2e-16 observed
-GENERALISED = {"f32": 2e-5, "f64": 1e-11}  # of the largest generalised force so far
+GENERALISED = {"f32": 1e-5, "f64": 1e-11}  # of the largest generalised force so far; 1e-8 and 1e-17 observed
 ASTRAY = 0.01  # cells that MJX's step may end apart from where the grains saw the bodies
 OVERLAP = 1e-3  # m, of bodies pressed on each other or on the floor
-CALM = 2.0  # m/s or rad/s
+CALM = 12.0  # m/s or rad/s; 4 observed, of the gate on its way
 SAME = 2e-3  # m, rad and parts of quaternions, between precisions
 
-MODEL = f"""<worldbody>
+MODEL = f"""<compiler angle="radian"/><worldbody>
   <geom name="floor" type="plane" size="1 1 1" {HARD}/>
   <body name="hung" pos=".2 .2 .42"><joint name="ball" type="ball" damping=".05" armature=".01"/>
     <geom name="paddle" type="box" size=".06 .06 .15" pos="0 0 -.2" density="800"/></body>
@@ -51,15 +51,15 @@ MODEL = f"""<worldbody>
 <actuator>
   <motor name="twist" joint="ball" gear="0 1 0"/>
   <motor name="push" joint="slide"/>
-  <position name="swing" joint="hinge" kp="20"/>
+  <position name="swing" joint="hinge" kp="60"/>
 </actuator>"""
 GEOMS = ("paddle", "pusher", "gate", "slab", "knob", "block")
 
 
 @cache
 def bed(precision: str) -> Bed:
-    """Sand all around what stands in it: the seeds leave out what lies within bodies' boxes."""
-    holes = ((0.1, 0.3, 0.1, 0.3), (0.45, 0.65, 0.05, 0.35), (0.1, 0.3, 0.45, 0.75), (0.4, 0.75, 0.45, 0.75))
+    """Sand around what stands in it, close to it on some sides."""
+    holes = ((0.1, 0.3, 0.1, 0.3), (0.45, 0.65, 0.05, 0.35), (0.1, 0.26, 0.5, 0.7), (0.4, 0.7, 0.5, 0.7))
     xs, ys = (sorted({0.0, SIDE, *(h[k] for h in holes for k in pair)}) for pair in ((0, 1), (2, 3)))
     fills = []
     for x0, x1 in pairwise(xs):
@@ -140,7 +140,7 @@ def test_every_joint_gets_what_its_jacobian_makes_of_the_sands_reaction(precisio
     d = done(precision)
     size = np.maximum.accumulate(np.abs(d.applied), axis=0)
     assert np.all(size[-1] > 1e-3), "the sand did not push along some joint"
-    np.testing.assert_array_less(np.abs(d.applied - d.by_jacobian), GENERALISED[precision] * size.max(axis=1)[:, None])
+    assert np.all(np.abs(d.applied - d.by_jacobian) <= GENERALISED[precision] * size.max(axis=1)[:, None])
 
 
 @each_precision
