@@ -109,7 +109,9 @@ def _examined(scene: Scene, before: State, after: State, contact: Array | int) -
     p, dx = after.grains, scene.grid.cell_size
     finite = jnp.ones((), bool)
     if after.rigid is not None:
-        finite = jnp.all(jnp.isfinite(after.rigid.qpos)) & jnp.all(jnp.isfinite(after.rigid.qvel))
+        d = after.rigid  # a mocap body told to go nowhere touches no grain, which then seem well
+        told = (d.qpos, d.qvel, d.mocap_pos, d.mocap_quat)
+        finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(a)) for a in told]))
     if not scene.slots:
         return replace(after, health=after.health | contact | as_bits({Health.NOT_FINITE: ~finite}))
     finite &= jnp.isfinite(jnp.sum(p.x) + jnp.sum(p.v) + jnp.sum(p.e))
