@@ -200,7 +200,9 @@ class Contact(NamedTuple):
         """Health bits of this rigid step's contact."""
         b, dx = self.scene.bodies, self.scene.grid.cell_size
         assert b is not None
+        # As MJX has it, which ends the step with its last speed, and as the grains saw a body that they stopped.
         travel = self._speed(self.stance.J @ touch.q + self.stance.drift) * self.scene.rigid_dt
+        travel = jnp.maximum(travel, self._gone(touch))
         return as_bits(
             {
                 Health.TOO_DEEP: report.depth > min(MOST_DEPTH * dx, *(HALFWAY * thickness(s) / 2 for s in b.shapes)),
@@ -215,10 +217,20 @@ class Contact(NamedTuple):
 
     def _speed(self, twist: Array) -> Array:
         """Speed () m/s of the fastest point of the coupled bodies, which move with these twists (B, 6)."""
+        return self._farthest(jnp.linalg.norm(twist[:, :3], axis=-1), jnp.linalg.norm(twist[:, 3:], axis=-1))
+
+    def _gone(self, touch: Touch) -> Array:
+        """How far () m the farthest point of the coupled bodies is from where it was at the rigid step's start."""
+        shift = jnp.linalg.norm(touch.centre - self.stance.centre, axis=-1)
+        chord = jnp.linalg.norm(touch.turn - _not_turned(self.stance), axis=(-2, -1)) / np.sqrt(2)
+        return self._farthest(shift, chord)
+
+    def _farthest(self, shift: Array, turn: Array) -> Array:
+        """The most () m that any point of the coupled bodies goes by these shifts (B,) m and turns (B,) rad."""
         b = self.scene.bodies
         assert b is not None
-        reach = jnp.asarray([_reach(b, i) for i in range(len(b.bodies))], twist.dtype)
-        return jnp.max(jnp.linalg.norm(twist[:, :3], axis=-1) + reach * jnp.linalg.norm(twist[:, 3:], axis=-1))
+        reach = jnp.asarray([_reach(b, i) for i in range(len(b.bodies))], shift.dtype)
+        return jnp.max(shift + reach * turn)
 
     def _surfaces(self, shares: Array | None, hold: np.ndarray) -> Surfaces:
         """How bodies are to points with these shares (M, K) of the materials, held back by up to hold (M,) N s."""
