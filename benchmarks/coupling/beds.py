@@ -50,8 +50,8 @@ def started(scene: Scene) -> State:
     return jax.device_put(jax.jit(partial(initial, scene))(jax.random.key(0)), jax.devices()[0])
 
 
-def at_rest(scene: Scene, state: State, surface: float) -> State:
-    """The state with each grain compressed by the sand above it, up to a level surface (m).
+def at_rest(scene: Scene, state: State, surface: float, gravity: float = G) -> State:
+    """The state with each grain compressed by the sand above it, up to a level surface (m), in gravity (m/s^2).
 
     Confined elastic sand: the weight above strains it along z only. Gravity that sets in at once would make the bed
     ring between nothing and twice its weight.
@@ -60,7 +60,7 @@ def at_rest(scene: Scene, state: State, surface: float) -> State:
     lam, mu = lame(material.E, material.nu)
     g = state.grains
     above = jnp.maximum(surface - scene.world(g.x)[2], 0)
-    strain = -material.rho * G * above / (lam + 2 * mu)
+    strain = -material.rho * gravity * above / (lam + 2 * mu)
     upright = 1 if scene.dimension == 2 else 2
     e = jnp.zeros_like(g.e).at[upright].set(jnp.expm1(2 * strain))
     tau = jnp.zeros_like(g.tau).at[:3].set(lam * strain).at[upright].set((lam + 2 * mu) * strain)
