@@ -14,7 +14,7 @@ RIGHT_VERSION := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3,
 WILL_DO := import ensurepip, venv; $(RIGHT_VERSION)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo bench test test-fast lint format pins clean
+.PHONY: help setup demo bench guard test test-xla test-fast lint format pins clean
 
 help:  ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /\1: /p' $(MAKEFILE_LIST) | awk -F': ' '{ printf "  make %-10s %s\n", $$1, $$2 }'
@@ -26,6 +26,9 @@ demo: $(READY)  ## dig sand, write the log and pictures to demo_out/ (ARGS=... a
 
 bench: $(READY)  ## all benchmarks, into docs/performance.md (ARGS=--quick; PEERS=folder, see benchmarks/README.md)
 	$(BIN)/python -m benchmarks $(ARGS) $(if $(PEERS),--peers $(PEERS))
+
+guard: $(READY)  ## has a substep become slower than the ratio kept? (ARGS=--keep keeps this run's)
+	$(BIN)/python -m benchmarks.guard $(ARGS)
 
 test: $(READY)  ## all tests, a process per core
 	$(BIN)/python -m pytest -n auto --dist loadfile $(ARGS)

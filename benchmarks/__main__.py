@@ -1,6 +1,6 @@
 """All benchmarks, or some, one after the other in processes of their own, and then the report.
 
-python -m benchmarks [--quick] [--peers VENVS] [SUITE ...]
+python -m benchmarks [--quick] [--keep] [--peers VENVS] [SUITE ...]
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ SUITES = {  # suite -> options of a full and of a quick run
     "stages": ([], ["--quick"]),
     "coupled": ([], ["--quick"]),
     "coldstart": ([], ["--quick"]),
-    "guard": (["--keep"], ["--keep"]),
+    "guard": ([], []),
     "compare": ([], ["--sizes", "10", "--rounds", "1"]),
 }
 
@@ -27,6 +27,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Run the benchmarks and write docs/performance.md.")
     parser.add_argument("suites", nargs="*", metavar="SUITE", help=f"{', '.join(SUITES)}; default: all")
     parser.add_argument("--quick", action="store_true", help="a few minutes: smaller, fewer rounds")
+    parser.add_argument("--keep", action="store_true", help="the guard keeps this run's ratios, and compares nothing")
     parser.add_argument("--peers", metavar="VENVS", help="folder of the other codes' environments; see compare.py")
     a = parser.parse_args()
     if unknown := set(a.suites) - set(SUITES):
@@ -36,6 +37,8 @@ def main() -> None:
         options = list(SUITES[suite][a.quick])
         if suite in ("compare", "coupled") and a.peers:
             options += ["--peers", a.peers]
+        if suite == "guard" and a.keep:
+            options.append("--keep")
         began = time.perf_counter()
         done = subprocess.run([sys.executable, "-m", f"benchmarks.{suite}", *options], cwd=machine.ROOT, check=False)
         print(f"{suite}: {time.perf_counter() - began:.0f} s", flush=True)

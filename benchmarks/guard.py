@@ -1,7 +1,7 @@
 """A guard against getting slower: a whole substep against a plain kernel of numpy, in the same run, as a ratio.
 
-    python -m benchmarks.guard            # status 1 if the ratio is 25 % worse than the one kept
-    python -m benchmarks.guard --keep     # keep this run's ratio
+    python -m benchmarks.guard            # status 1 if the ratio is 25 % worse than the one kept; the first run keeps it
+    python -m benchmarks.guard --keep     # keep this run's ratio, since it is meant to be another
 
 The plain kernel scatters and gathers eight numbers per grain through one node, so it is bound by the same caches and
 memory; it has nothing of this package in it. On another machine the ratio is another: keep one there first.
@@ -76,6 +76,7 @@ def main() -> None:
     for kernels, new in now.items():
         before = kept["ratios"].get(kernels)
         if before is None:
+            print(f"{kernels}: {new:.3g} times the plain kernel, none kept to compare with")
             continue
         slow |= new > WORSE * before
         word = "slower" if new > WORSE * before else "fine"

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks import box, report, stages
+from benchmarks import box, guard, report, stages
 from benchmarks.clock import in_turns, spread
 from benchmarks.coupled import DIG_STEPS, Run, digging
 from benchmarks.throughput import HEAPS, fit, merged, same_job
@@ -95,6 +95,32 @@ def test_goal_for_bodies_is_that_of_standard_fidelity(monkeypatch: pytest.Monkey
 def test_report_needs_no_results(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(report.results, "FOLDER", tmp_path)
     assert "| - |" in report.goals()
+
+
+def guarded(ratio: float, *options: str) -> int:
+    """The exit status of the guard for a ratio of native kernels."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(guard, "ratio", lambda kernels: ratio)
+        patch.setattr(guard, "kernels_here", lambda: (["native"], []))
+        patch.setattr(guard.job, "pin", lambda cores: None)
+        patch.setattr(sys, "argv", ["guard", *options])
+        try:
+            guard.main()
+        except SystemExit as end:
+            return int(end.code or 0)
+    return 0
+
+
+def test_guard_compares_with_the_ratio_kept_and_keeps_another_only_when_told(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(guard.results, "FOLDER", tmp_path)
+    monkeypatch.setattr(guard.machine, "ROOT", tmp_path)
+    assert guarded(1.0) == 0  # the first run keeps
+    assert guarded(1.2) == 0
+    assert guarded(1.3) == 1  # and has not kept 1.2
+    assert guarded(1.3, "--keep") == 0
+    assert guarded(1.5) == 0
 
 
 @pytest.mark.slow
