@@ -1,6 +1,6 @@
 """A guard against getting slower: a whole substep against a plain kernel of numpy, in the same run, as a ratio.
 
-    python -m benchmarks.guard            # status 1 if the ratio is 25 % worse than the one kept; the first run keeps it
+    python -m benchmarks.guard            # status 1 if the ratio is 25 % worse than the one kept; kept by the first run
     python -m benchmarks.guard --keep     # keep this run's ratio, since it is meant to be another
 
 The plain kernel scatters and gathers eight numbers per grain through one node, so it is bound by the same caches and

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks import box, guard, report, stages
+from benchmarks import box, goals, guard, report, stages
 from benchmarks.clock import in_turns, spread
 from benchmarks.coupled import DIG_STEPS, Run, digging
 from benchmarks.throughput import HEAPS, fit, merged, same_job
@@ -85,16 +85,48 @@ def test_cost_of_a_call_is_no_part_of_a_stage(monkeypatch: pytest.MonkeyPatch) -
     assert stages.seconds({"stage": lambda times: None}, 1)["stage"] == pytest.approx(once)
 
 
-def test_goal_for_bodies_is_that_of_standard_fidelity(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(report.results, "FOLDER", tmp_path)
-    steps = {"draft": {"share on top of grains": 0.875}, "standard": {"share on top of grains": 0.125}}
+@pytest.mark.parametrize(("share", "verdict"), [(0.125, "yes"), (0.5, "MISSED")])
+def test_goal_for_bodies_is_that_of_standard_fidelity(
+    share: float, verdict: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(goals.results, "FOLDER", tmp_path)
+    steps = {"draft": {"share on top of grains": 0.875}, "standard": {"share on top of grains": share}}
     (tmp_path / "stages.json").write_text(json.dumps({"kernels": {"native": {"dig, rigid step": steps}}}))
-    assert "| native: bodies in the dig scene, on top of grains | <= 0.3 | 0.125 |" in report.goals()
+    assert f"| native: bodies in the dig scene, on top of grains | <= 0.3 | {share} | {verdict} |" in goals.section()
+
+
+@pytest.mark.parametrize(
+    ("wanted", "value", "verdict"),
+    [("< 5", 5.0, "MISSED"), ("<= 5", 5.0, "yes"), ("> 1", 1.1, "yes"), (">= 2", 1, "MISSED"), ("< 5", None, "-")],
+)
+def test_goals_are_met_or_missed(wanted: str, value: float | None, verdict: str) -> None:
+    assert goals.met(wanted, value) == verdict
+
+
+def test_goal_of_a_word_is_met_by_it() -> None:
+    assert (goals.met("yes", "yes"), goals.met("yes", "no")) == ("yes", "MISSED")
 
 
 def test_report_needs_no_results(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(report.results, "FOLDER", tmp_path)
-    assert "| - |" in report.goals()
+    monkeypatch.setattr(goals.results, "FOLDER", tmp_path)
+    assert "| - |" in goals.section()
+
+
+def test_missed_goal_is_explained_with_the_numbers_of_the_results(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(goals.results, "FOLDER", tmp_path)
+    rates = {"f32": {"Mpss_cpu": {"median": 20.0}}, "f64": {"Mpss_cpu": {"median": 6.5}}}
+    (tmp_path / "throughput.json").write_text(json.dumps({"sweeps": {"precision": {"native": rates}}}))
+    assert "f64 itself runs at 6.5 M/s" in goals.section()
+    rates["f64"] = {"Mpss_cpu": {"median": 9.0}}
+    (tmp_path / "throughput.json").write_text(json.dumps({"sweeps": {"precision": {"native": rates}}}))
+    assert "Why some were missed" not in goals.section()
+
+
+def test_box_that_only_sinks_is_not_said_to_move_up() -> None:
+    assert report.upwards(-0.0022) == "never moves up"
+    assert report.upwards(0.0279) == "moves up at 0.0279 m/s at most"
 
 
 def guarded(ratio: float, *options: str) -> int:
