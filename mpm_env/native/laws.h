@@ -211,16 +211,17 @@ template <class S, int D> struct Snow {
       : lam(p[0]), mu(p[1]), theta_c(p[2]), theta_s(p[3]), xi(p[4]), least_Jp(p[5]), most_ln_Jp(p[6]), least_b(p[7]) {}
   INLINE void operator()(Sym<S, D>& e, Sym<S, D>& tau, Pack<S>& memory) const {
     auto r = eigen(e);
-    Pack<S> s[3], g[3], ratio[3];
+    Pack<S> s[3], g[3], ratio[3], flow(S(1));
     for (int i = 0; i < 3; ++i) {
       Pack<S> b = largest(r.value[i], least_b - S(1)), free = b / (S(1) + root(S(1) + b));  // stretch minus one
       s[i] = smallest(largest(free, -theta_c), theta_s);
       ratio[i] = (free - s[i]) / (S(1) + s[i]);
+      flow = flow * (S(1) + ratio[i]);
       g[i] = s[i] * (S(2) + s[i]);
     }
     // (1 + a)(1 + b)(1 + c) - 1 without losing the digits of small a, b, c.
     auto joint = [](const Pack<S>* a) { Pack<S> ab = a[0] + a[1] + a[0] * a[1]; return ab + a[2] + ab * a[2]; };
-    memory = smallest(memory + log1p(joint(ratio)), most_ln_Jp);
+    memory = smallest(memory + log1p(joint(ratio), flow), most_ln_Jp);
     Pack<S> Jp = largest(exp(memory), least_Jp), harder = exp(xi * (S(1) - Jp)), Jm1 = joint(s);
     Pack<S> volume = lam * Jm1 * (S(1) + Jm1);
     for (auto& a : s) a = harder * (S(2) * mu * a * (S(1) + a) + volume);

@@ -113,15 +113,18 @@ template <class S> INLINE Pack<S> per_root(Pack<S> a) {  // 1 / sqrt(a) for a > 
 }
 
 // ln(1 + x), x > -1, to the last digits also for small x: 1 + x = 2^k (1 + r), then ln(1 + r) = 2 artanh(r / (2 + r)).
-template <class S> INLINE Pack<S> log1p(Pack<S> x) {
+// y is 1 + x as one knows it: near zero it holds digits that x has lost.
+template <class S> INLINE Pack<S> log1p(Pack<S> x, Pack<S> y) {
   typedef typename IntOf<S>::type I;
   constexpr int terms = sizeof(S) == 4 ? 4 : 10;
-  Bits<S> k = (bits((x + S(1)) * S(1.41421356237309504880)) >> I(IntOf<S>::mantissa)) - I(IntOf<S>::bias);
+  Bits<S> k = (bits(y * S(1.41421356237309504880)) >> I(IntOf<S>::mantissa)) - I(IntOf<S>::bias);
   Pack<S> scale = floats<S>((I(IntOf<S>::bias) - k) << I(IntOf<S>::mantissa));  // 2^-k
-  Pack<S> r = x * scale + (scale - S(1)), s = r / (r + S(2)), s2 = s * s, sum(S(2) / S(2 * terms + 1));
+  Pack<S> r = select<S>(x < S(-0.5), y * scale - S(1), x * scale + (scale - S(1)));
+  Pack<S> s = r / (r + S(2)), s2 = s * s, sum(S(2) / S(2 * terms + 1));
   for (int i = terms - 1; i >= 0; --i) sum = sum * s2 + S(2) / S(2 * i + 1);
   return s * sum + number<S>(k) * S(0.69314718055994530942);
 }
+template <class S> INLINE Pack<S> log1p(Pack<S> x) { return log1p(x, x + S(1)); }
 
 // exp(x) as 2^k (1 + part): part = exp(r) - 1 for a small r. Beyond the range of exponents, as far as that goes.
 template <class S> INLINE Pack<S> exp_part(Pack<S> x, Pack<S>& power) {

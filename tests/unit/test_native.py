@@ -5,6 +5,7 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -155,48 +156,60 @@ def turned(values: np.ndarray, rng: np.random.Generator, d: int) -> np.ndarray:
     return np.stack([A[:, 0, 0], A[:, 1, 1], A[:, 2, 2], A[:, 1, 2], A[:, 0, 2], A[:, 0, 1]])
 
 
+# Share of the grains -> what their error may be, relative to the largest element, beside thrice the reference's own in
+# f32: rounding for nearly all, which is 1e-6 at most, and a little more for the worst. No answer at all has error 1.
+NEAR = {0.5: 5e-6, 0.9: 5e-6, 1.0: 2e-5}
+# What is too small to compare by: of strain, stress (Pa) and history.
+SMALLEST = {"e": 1e-7, "tau": 1.0, "history": 1e-6}
+
+
+def errors(law: str, d: int, values: Callable[[np.random.Generator, int], np.ndarray]) -> dict[str, np.ndarray]:
+    """Strain, stress and history that the law makes of principal strains, through a grid at rest: errors (2, n).
+
+    Of the kernels in f32, and of the reference in f32; both next to the reference in f64.
+    """
+    rng = np.random.default_rng(3)
+    p = grains(d, "float32")
+    e = jnp.asarray(turned(values(rng, p.count), rng, d), "float32")
+    p = replace(p, x=jnp.full_like(p.x, 0.05), m=jnp.ones_like(p.m), e=e)
+    got = move(grid(d), Bed(material(law, "float32"), 0, p.count), p, jnp.zeros((*grid(d).shape, 4)), TIME, "native")
+    with jax.enable_x64(True):
+        wide = jnp.asarray(np.asarray(e), "float64")
+        truth = material(law, "float64").update(wide, jnp.zeros((1, p.count), "float64"))
+    plain, found = material(law, "float32").update(e, jnp.zeros((1, p.count), "float32")), {}
+    for name, *rows in zip(("e", "history", "tau"), (got.e, got.history, got.tau), plain, truth, strict=True):
+        mine, usual, true = (np.asarray(a, float) for a in rows)
+        assert np.isfinite(mine).all()
+        assert np.abs(mine).max() <= 2 * np.abs(true).max() + SMALLEST[name]
+        size = np.maximum(np.abs(true).max(axis=0), np.abs(usual).max(axis=0)) + SMALLEST[name]
+        found[name] = np.stack([np.abs(a - true).max(axis=0) / size for a in (mine, usual)])
+    return found
+
+
 @each_dimension
 @each_law
 @pytest.mark.parametrize("case", list(EXTREMES))
 def test_laws_at_the_extremes(d: int, law: str, case: str) -> None:
-    """What the law makes of a strain, through a grid at rest, next to the reference in f64.
-
-    An eigenvalue of b carries the rounding of the largest one, so below that share the strain of the smallest ones is
-    unknowable in f32, to the reference in f32 as well: both must then be equally near.
-    """
-    rng = np.random.default_rng(3)
-    p = grains(d, "float32")
-    e = jnp.asarray(turned(EXTREMES[case](rng, p.count), rng, d), "float32")
-    p = replace(p, x=jnp.full_like(p.x, 0.05), m=jnp.ones_like(p.m), e=e)
-    nodes = jnp.zeros((*grid(d).shape, 4), "float32")
-    got = move(grid(d), Bed(material(law, "float32"), 0, p.count), p, nodes, TIME, "native")
-    with jax.enable_x64(True):
-        wide = jnp.asarray(np.asarray(e), "float64")
-        true_e, _, true_tau = material(law, "float64").update(wide, jnp.zeros((1, p.count), "float64"))
-    plain_e, _, plain_tau = material(law, "float32").update(e, jnp.zeros((1, p.count), "float32"))
-    for mine, plain, true in ((got.e, plain_e, true_e), (got.tau, plain_tau, true_tau)):
-        mine, plain, true = (np.asarray(a, float) for a in (mine, plain, true))
-        assert np.isfinite(mine).all()
-        size = np.maximum(np.abs(true).max(axis=0), np.abs(plain).max(axis=0)) + (1e-7 if mine is got.e else 1.0)
-        error, usual = np.abs(mine - true).max(axis=0) / size, np.abs(plain - true).max(axis=0) / size
-        assert error.max() <= 2e-5 + 3 * usual.max()
+    """An eigenvalue of b carries the rounding of the largest one, so below that share the strain of the smallest ones
+    is unknowable in f32, to the reference in f32 as well: both must then be equally near."""
+    for name, both_errors in errors(law, d, EXTREMES[case]).items():
+        for share, near in NEAR.items():
+            mine, usual = np.quantile(both_errors, share, axis=1)
+            assert mine <= near + 3 * usual, (name, share)
 
 
 @each_dimension
 @each_law
 def test_stretched_and_pressed_a_thousandfold_at_once(d: int, law: str) -> None:
-    """The small stretches are lost in the rounding of the large ones: what is left to ask is a bounded answer."""
-    rng = np.random.default_rng(4)
-    p = grains(d, "float32")
-    e = jnp.asarray(turned(np.exp(2 * rng.uniform(np.log(1e-3), np.log(1e3), (3, p.count))) - 1, rng, d), "float32")
-    p = replace(p, x=jnp.full_like(p.x, 0.05), m=jnp.ones_like(p.m), e=e)
-    got = move(grid(d), Bed(material(law, "float32"), 0, p.count), p, jnp.zeros((*grid(d).shape, 4)), TIME, "native")
-    with jax.enable_x64(True):
-        wide = jnp.asarray(np.asarray(e), "float64")
-        true_e, _, true_tau = material(law, "float64").update(wide, jnp.zeros((1, p.count), "float64"))
-    for mine, true in ((got.e, true_e), (got.tau, true_tau)):
-        assert np.isfinite(np.asarray(mine)).all()
-        assert np.abs(np.asarray(mine)).max() <= 1.1 * np.abs(np.asarray(true)).max()
+    """The small stretches of some grains are lost in the rounding of the large ones: of the worst nothing is asked."""
+
+    def values(rng: np.random.Generator, n: int) -> np.ndarray:
+        return np.exp(2 * rng.uniform(np.log(1e-3), np.log(1e3), (3, n))) - 1
+
+    for name, both_errors in errors(law, d, values).items():
+        for share in (0.5, 0.9):
+            mine, usual = np.quantile(both_errors, share, axis=1)
+            assert mine <= NEAR[share] + 3 * usual < 0.6, (name, share)
 
 
 def test_what_is_not_finite_stays_visible() -> None:
@@ -209,11 +222,22 @@ def test_what_is_not_finite_stays_visible() -> None:
 
 @each_dimension
 def test_grains_outside_the_grid_are_kept_on_it(d: int) -> None:
-    """Flagged by the caller, they must not write anywhere else."""
-    p = grains(d, "float32")
-    far = replace(p, x=p.x.at[:, 7].set(jnp.inf).at[:, 9].set(-1e30).at[:, 11].set(1e6))
-    nodes = to_nodes(grid(d), far, TIME, jnp.zeros((d,)), NONE, "native")
-    assert nodes.shape == (*grid(d).shape, 4)
+    """Flagged by the caller, they spoil the corners that they are kept in: no other node, no neighbour in a batch."""
+    p, strays = grains(d, "float32"), jnp.array([7, 9, 11])
+    x = p.x.at[:, 7].set(jnp.inf).at[:, 9].set(-1e30).at[:, 11].set(1e6)
+    far, without = (replace(p, x=x, m=p.m.at[strays].set(m)) for m in (1.0, 0.0))
+    every = jnp.arange(grid(d).nodes, dtype=jnp.int32)
+    one = partial(to_nodes, grid(d), dt=TIME, gravity=jnp.zeros((d,)), watched=every, kernels="native")
+    many = jax.vmap(one)(jax.tree.map(lambda *a: jnp.stack(a), p, far, p))
+    spoilt, clean, alone = np.asarray(many[1]), np.asarray(one(without)), np.asarray(one(p))
+    elsewhere = np.ones(grid(d).shape, bool)
+    # Windows are three nodes wide, and four along the last axis.
+    for corner in ((*[slice(0, 3)] * (d - 1), slice(0, 4)), (*[slice(-3, None)] * (d - 1), slice(-4, None))):
+        elsewhere[corner] = False
+        assert not np.allclose(spoilt[corner], clean[corner], rtol=0.1)
+    assert np.abs(spoilt - clean)[elsewhere].max() <= ROUNDING["float32"] * np.abs(clean).max()
+    for neighbour in (0, 2):
+        np.testing.assert_array_equal(np.asarray(many[neighbour]), alone)
 
 
 @each_dimension
@@ -252,7 +276,6 @@ DIGEST = """
 import hashlib, sys, jax, numpy as np
 sys.path.insert(0, {root!r})
 from tests.unit.test_native import grains, material, walk
-from coupling import constraints, contact, exchange, geoms, meeting
 from mpm_env import native
 p = grains(3, "float32")
 after = walk(p, (material("sand", "float32"),), d=3, beds=((0, p.count),), kernels="native")
