@@ -22,6 +22,7 @@ from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 
 from benchmarks import job, limits, results
@@ -41,6 +42,12 @@ DIG_AT = 1.0  # s: the bucket is in the bed
 DIG_ROUNDS = 3 * ROUNDS  # most of its stages are small differences of large numbers
 FIDELITIES = ("draft", "standard")
 PER_SUBSTEP = ("exchange with nodes", "grains stopped")  # the other stages run once per rigid step
+
+ORDERS = {  # substep on grains of which so many are out of order
+    "whole substep, sorted": 0.0,
+    "whole substep, nearly sorted": sorting.MOST_DISORDER,
+    "whole substep, shuffled": 1.0,
+}
 
 Stage = Callable[[int], Any]  # runs it so many times
 
@@ -97,11 +104,22 @@ def continuum(scene: Scene, state: State) -> dict[str, Stage]:
         "g2p and material": repeated(lambda p: substep.move(grid, bed, p, nodes, dt, kernels), p),
         "sort, if it were done": repeated(lambda p: sorting.by_cell(sorting.cells(grid, p, scene.spans), p), p),
     }
+    order = sorting.by_cell(sorting.cells(grid, p, scene.spans), jnp.arange(p.count))
+    for name, share in ORDERS.items():
+        now = jax.tree.map(partial(jnp.take, indices=strewn(order, share), axis=-1), p)
+        stages[name] = repeated(substeps(scene, state), (now, None))
     if kernels == "xla":
         bare = bed._replace(material=NoStress())
         stages["p2g"] = anew(lambda p: transfer.p2g(grid, p, dt, substep.chunk_of(p)), p)
         stages["g2p"] = repeated(lambda p: substep.move(grid, bare, p, nodes, dt, kernels), p)
     return stages
+
+
+def strewn(order: Array, share: float) -> Array:
+    """Slots (n,) in this order, but for a share that changed places at random; of few, as many are out of order."""
+    rng, n = np.random.default_rng(0), order.size
+    some = rng.choice(n, round(share * n), replace=False)
+    return order.at[some].set(order[rng.permutation(some)])
 
 
 def substeps(scene: Scene, state: State, boundary: Any = None) -> Callable[[Any], tuple[Particles, Any]]:
@@ -243,7 +261,8 @@ def main() -> None:
     a = parser.parse_args()
     job.pin(1)
     found, missing = kernels_here()
-    content = {"quick": a.quick, "kernels": {kernels: measured(kernels, a.quick) for kernels in found}}
+    content: dict[str, Any] = {"quick": a.quick, "most_disorder": sorting.MOST_DISORDER}
+    content |= {"kernels": {kernels: measured(kernels, a.quick) for kernels in found}}
     results.write("stages", content | {"left_out": missing, "limits": limits.core() | limits.substep_needs()})
 
 

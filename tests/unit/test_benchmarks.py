@@ -15,6 +15,7 @@ from benchmarks import box, goals, guard, report, stages
 from benchmarks.clock import in_turns, spread
 from benchmarks.coupled import DIG_STEPS, Run, digging
 from benchmarks.throughput import HEAPS, fit, merged, same_job
+from mpm_env.mpm import sorting
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 
@@ -77,6 +78,19 @@ def test_stage_on_the_same_values_is_run_each_time() -> None:
     assert calls == [3] * 7
     run(0)
     assert len(calls) == 7
+
+
+@pytest.mark.parametrize(("share", "disorder"), [(0.0, 0.0), (0.05, 0.05), (1.0, 0.5)])
+def test_strewn_grains_are_as_disordered_as_asked(share: float, disorder: float) -> None:
+    cell = stages.strewn(jnp.arange(20_000), share)
+    assert float(sorting.disorder(cell)) == pytest.approx(disorder, abs=0.005)
+    np.testing.assert_array_equal(np.sort(cell), np.arange(20_000))
+
+
+def test_sort_pays_when_what_it_saves_comes_to_what_it_costs() -> None:
+    times = {"whole substep, sorted": 40.0, "whole substep, nearly sorted": 42.0, "sort, if it were done": 30.0}
+    assert "after 15 substeps" in report.sort_pays(times, "dig", 0.05)
+    assert "does not pay" in report.sort_pays(times | {"whole substep, nearly sorted": 39.0}, "dig", 0.05)
 
 
 def test_cost_of_a_call_is_no_part_of_a_stage(monkeypatch: pytest.MonkeyPatch) -> None:
