@@ -135,11 +135,27 @@ def coldstart(r: dict[str, Any]) -> str:
     """The wait for the first step."""
     caches = ("empty cache", "filled cache")
     names = [name for name in r[caches[0]] if name != "peak_mb"]
-    rows = [[n, *(f"{r[c][n]['wall']} ({r[c][n]['cpu']})" for c in caches)] for n in names]
+    rows = [[n, *(both(r[c][n]) for c in caches)] for n in names]
     rows.append(["peak memory, MB", *(r[c]["peak_mb"] for c in caches)])
-    return f"`{r['environment']}`, fidelity: {r['fidelity']}. Wall seconds, CPU seconds in brackets.\n\n" + table(
-        ["", *(f"{c} of compiled programs" for c in caches)], rows
-    )
+    heads = [f"{c} of compiled programs" for c in caches]
+    text = f"`{r['environment']}`, fidelity: {r['fidelity']}. Wall seconds, CPU seconds in brackets.\n\n"
+    text += table(["", *heads], rows)
+    if run := r.get("run"):
+        text += f"\n`mpm-env run {run['scene']}`, of which {run['duration']} s are simulated, one frame:\n\n"
+        cells = [[part, *(both(run[c][part]) for c in caches)] for part in run[caches[0]]]
+        text += table(["", *heads], cells)
+    if batch := r.get("batch"):
+        ms = batch["cpu_ms"]
+        text += (
+            f"\nA step of {batch['envs']} such environments takes {ms['all step']} ms of CPU time, and"
+            f" {ms['one starts anew']} ms if one of them starts anew.\n"
+        )
+    return text
+
+
+def both(times: dict[str, float]) -> str:
+    """Wall seconds, and CPU seconds in brackets where they are known."""
+    return f"{times['wall']} ({times['cpu']})" if "cpu" in times else str(times["wall"])
 
 
 def coupled(r: dict[str, Any]) -> str:
