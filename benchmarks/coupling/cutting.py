@@ -12,21 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.coupling.beds import (
-    RHO,
-    G,
-    about_y,
-    at_rest,
-    block,
-    planted,
-    ride,
-    sand,
-    soft_travel,
-    started,
-    with_sand,
-    without,
-)
-from mpm_env import Fidelity, Scene, SceneConfig, build
+from benchmarks.coupling.beds import RHO, G, at_rest, sand, with_sand, without
+from benchmarks.coupling.scenes import Bed, about, planted, ride, soft_travel
 
 DEPTH = 0.2  # m, of the bed
 LENGTH = 5 * DEPTH  # of the box
@@ -41,7 +28,7 @@ WINDOW = (0.05, 0.1)  # of DEPTH, the travel over which forces are averaged
 
 
 @cache
-def bed(cells: int) -> Scene:
+def bed(cells: int) -> Bed:
     """Sand on a floor, so many cells deep, and two blades that are told where to go, their tips at their origins."""
     dx = DEPTH / cells
     thick, under, high = 6 * dx, 3 * dx, 2 * DEPTH
@@ -50,22 +37,18 @@ def bed(cells: int) -> Scene:
           pos="{-thick / 2} 0 {(high - under) / 2}" size="{thick / 2} {WIDTH} {(high + under) / 2}"/></body>"""
         for name in BLADES
     )
-    config = {
-        "name": "cutting",
-        "plane_strain": True,
-        "box": {"lower": (0, 0, 0), "upper": (LENGTH, WIDTH, 2 * DEPTH)},
-        "feature": DEPTH,
-        "duration": 1.0,
-        "speed": 1.0,
-        "walls": {"z_lower": {"kind": "separate", "friction": 0.5}},
-        "grains": [{"material": sand(30.0, E), "fill": [block((0, 0, 0), (LENGTH, WIDTH, DEPTH))]}],
-        "bodies": {
-            "mjcf": f"<mujoco><worldbody>{blades}</worldbody></mujoco>",
-            "couple": list(BLADES),
-            "friction_of": {name: float(np.tan(np.radians(delta))) for name, delta in BLADES.items()},
-        },
-    }
-    return build(SceneConfig(**config), Fidelity(cells=cells, rigid_dt=RIGID_DT))
+    return Bed(
+        f"<worldbody>{blades}</worldbody>",
+        tuple(BLADES),
+        (LENGTH, WIDTH, 2 * DEPTH),
+        (((0, 0, 0), (LENGTH, WIDTH, DEPTH)),),
+        dx,
+        2,
+        rigid_dt=RIGID_DT,
+        material=sand(30.0, E),
+        bodies={"friction_of": {name: float(np.tan(np.radians(delta))) for name, delta in BLADES.items()}},
+        speed=1.0,
+    )
 
 
 class Cut(NamedTuple):
@@ -94,26 +77,27 @@ class Cut(NamedTuple):
 
 def cut(cells: int, friction_deg: float, rake_deg: float = 90.0, blade: str = "smooth", speed: float = SPEED) -> Cut:
     """Push a blade through a bed so many cells deep; the rake is measured from the floor."""
-    scene = bed(cells)
+    scene = bed(cells).scene()
     mine = list(BLADES).index(blade)
-    leaning = about_y(rake_deg - 90)
+    leaning = about("y", rake_deg - 90)
 
     def pose(travel: float) -> tuple[np.ndarray, np.ndarray]:
         at = np.stack([AWAY, AWAY])
         at[mine] = (TIP + travel, WIDTH / 2, 0)
         return at, np.stack([leaning, leaning])
 
-    state = with_sand(started(scene), friction_deg=friction_deg)
+    state = with_sand(bed(cells).start(), friction_deg=friction_deg)
     x, z = scene.world(state.grains.x)[::2]
     rake = np.radians(rake_deg)
     behind = (x - TIP) * np.sin(rake) + z * np.cos(rake) < 0
     state = planted(scene, at_rest(scene, without(state, behind), DEPTH), *pose(0.0))
     enough = WINDOW[1] * DEPTH / speed + RAMP
     travel = soft_travel(RIGID_DT * np.arange(1, 1 + int(enough / RIGID_DT)), speed, RAMP)
-    done = ride(scene, state, travel, pose, mine)
+    done = ride(scene, state, travel, pose)
+    force = done.force(mine)
     scale = RHO * G * DEPTH**2 * WIDTH
-    push = np.hypot(done.force[:, 0], done.force[:, 2])
-    return Cut(done.travel / DEPTH, push / scale, -done.force[:, 0] / scale, int(done.last.health), done.cpu_s)
+    push = np.hypot(force[:, 0], force[:, 2])
+    return Cut(done.travel / DEPTH, push / scale, -force[:, 0] / scale, int(done.last.health), done.cpu_s)
 
 
 def passive(friction_deg: float) -> float:

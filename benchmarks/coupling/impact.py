@@ -10,16 +10,14 @@ same sand under a body so much lighter, and the fall is done before the run begi
 from __future__ import annotations
 
 import time
-from dataclasses import replace
 from functools import cache
 from typing import NamedTuple, TypeVar
 
-import jax
 import numpy as np
 
-from benchmarks.coupling.beds import RHO, ROWS, G, at_rest, block, exponent, line, program, sand, started, with_sand
-from coupling import bodies as rigid
-from mpm_env import Fidelity, Scene, SceneConfig, build, scripted
+from benchmarks.coupling.beds import RHO, G, at_rest, sand, with_sand
+from benchmarks.coupling.fits import exponent, line
+from benchmarks.coupling.scenes import ROWS, Bed, run, shifted
 
 SIZE = 0.1  # m, diameter of the ball
 HALF_ANGLE_DEG = 30.0  # of the cone
@@ -49,29 +47,25 @@ def _geom(kind: str, rho: float) -> tuple[str, str]:
 
 
 @cache
-def drop_scene(kind: str, cells: int, courant: float, whole: bool) -> Scene:
+def bed(kind: str, cells: int, courant: float, whole: bool) -> Bed:
     """A "ball" or "cone" as dense as the sand, a cell above a bed with so many cells to SIZE."""
     side, surface = WALLS * SIZE, DEPTH * SIZE
     low = -side if whole else 0.0
     asset, geom = _geom(kind, RHO if whole else RHO / 4)
     joint = "<freejoint/>" if whole else '<joint type="slide" axis="0 0 1"/>'
-    material = sand(float(np.degrees(np.arctan(REPOSE))), E) | {"friction_fit": "triaxial"}
-    config = {
-        "name": kind,
-        "box": {"lower": (low, low, 0), "upper": (side, side, surface + ABOVE * SIZE)},
-        "feature": SIZE,
-        "duration": LONGEST,
-        "speed": 5.0,
-        "walls": {"z_lower": {"kind": "separate", "friction": 0.5}},
-        "grains": [{"material": material, "fill": [block((low, low, 0), (side, side, surface))]}],
-        "bodies": {
-            "mjcf": f"""<mujoco>{asset}<worldbody><body name="body" pos="0 0 {surface + SIZE / cells}">{joint}{geom}
-              </body></worldbody></mujoco>""",
-            "couple": ["body"],
-            "friction": FRICTION,
-        },
-    }
-    return build(SceneConfig(**config), Fidelity(cells=cells, rigid_dt=RIGID_DT, courant=courant))
+    return Bed(
+        f"""{asset}<worldbody><body name="body" pos="0 0 {surface + SIZE / cells}">{joint}{geom}</body></worldbody>""",
+        ("body",),
+        (side - low, side - low, surface + ABOVE * SIZE),
+        (((low, low, 0), (side, side, surface)),),
+        SIZE / cells,
+        friction=FRICTION,
+        rigid_dt=RIGID_DT,
+        material=sand(float(np.degrees(np.arctan(REPOSE))), E, "triaxial"),
+        fidelity={"courant": courant},
+        lower=(low, low, 0),
+        speed=5.0,
+    )
 
 
 class Drop(NamedTuple):
@@ -98,17 +92,17 @@ def drop(
 
     courant is the fidelity's; friction_deg of the sand, if not REPOSE's.
     """
-    scene, surface = drop_scene(kind, cells, courant, whole), DEPTH * SIZE
+    dropped = bed(kind, cells, courant, whole)
+    scene, surface = dropped.scene(), DEPTH * SIZE
     gap, up = SIZE / cells, 2 if whole else 0
-    state = at_rest(scene, with_sand(started(scene), denser=1 / ratio, friction_deg=friction_deg), surface)
+    state = at_rest(scene, with_sand(dropped.start(), denser=1 / ratio, friction_deg=friction_deg), surface)
     speed = np.sqrt(2 * G * (height - gap))
-    falling = state.rigid.replace(qvel=state.rigid.qvel.at[up].set(-speed))
-    state = replace(state, rigid=rigid.refresh(scene.bodies, falling))
-    first, run, drive = float(state.rigid.qpos[up]), program(scene), scripted(scene, 0, ROWS)
-    jax.block_until_ready(run(state, drive))  # compiles
+    state = shifted(scene, state, qvel=np.asarray(state.rigid.qvel) - speed * np.eye(len(state.rigid.qvel))[up])
+    first = float(state.rigid.qpos[up])
+    run(scene, state, ROWS)  # compiles
     began, slow = time.process_time(), 0
     for _ in range(round(longest / RIGID_DT / ROWS)):
-        state, _ = run(state, drive)
+        state, _ = run(scene, state, ROWS)
         slow = slow + 1 if abs(float(state.rigid.qvel[up])) < STILL else 0
         if slow == 2:
             break

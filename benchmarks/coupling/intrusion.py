@@ -12,22 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.coupling.beds import (
-    RHO,
-    G,
-    about_y,
-    at_rest,
-    block,
-    planted,
-    ride,
-    sand,
-    smooth,
-    soft_travel,
-    started,
-    with_sand,
-    without,
-)
-from mpm_env import Fidelity, Scene, SceneConfig, build
+from benchmarks.coupling.beds import RHO, G, at_rest, sand, with_sand, without
+from benchmarks.coupling.fits import smooth
+from benchmarks.coupling.scenes import Bed, about, planted, ride, soft_travel
 
 SIDE = 0.1  # m, of the plate
 THICK = 0.2  # of SIDE
@@ -43,26 +30,23 @@ BURIED = 0.4  # of SIDE, a depth from which on a plate pushed down is under the 
 
 
 @cache
-def bed(cells: int) -> Scene:
+def bed(cells: int) -> Bed:
     """Sand with half a plate at its mirror y = 0, so many cells to a side of the plate; the plate waits above."""
     x, y, z = HALF_LENGTH * SIDE, HALF_WIDTH * SIDE, DEPTH * SIDE
     size = f"{SIDE / 2} {SIDE / 2} {THICK * SIDE / 2}"
-    config = {
-        "name": "intrusion",
-        "box": {"lower": (-x, 0, 0), "upper": (x, y, z + ABOVE * SIDE)},
-        "feature": SIDE,
-        "duration": 1.0,
-        "speed": 1.0,
-        "walls": {"z_lower": {"kind": "separate", "friction": 0.5}},
-        "grains": [{"material": sand(FRICTION_DEG, E), "fill": [block((-x, 0, 0), (x, y, z))]}],
-        "bodies": {
-            "mjcf": f"""<mujoco><worldbody><body name="plate" mocap="true" pos="0 0 {z + SIDE}">
-              <geom name="plate" type="box" size="{size}"/></body></worldbody></mujoco>""",
-            "couple": ["plate"],
-            "friction": FRICTION,
-        },
-    }
-    return build(SceneConfig(**config), Fidelity(cells=cells, rigid_dt=RIGID_DT))
+    return Bed(
+        f"""<worldbody><body name="plate" mocap="true" pos="0 0 {z + SIDE}">
+          <geom name="plate" type="box" size="{size}"/></body></worldbody>""",
+        ("plate",),
+        (2 * x, y, z + ABOVE * SIDE),
+        (((-x, 0, 0), (x, y, z)),),
+        SIDE / cells,
+        friction=FRICTION,
+        rigid_dt=RIGID_DT,
+        material=sand(FRICTION_DEG, E),
+        lower=(-x, 0, 0),
+        speed=1.0,
+    )
 
 
 class Motion(NamedTuple):
@@ -102,15 +86,15 @@ class Push(NamedTuple):
 
 def push(cells: int, motion: Motion, friction_deg: float = FRICTION_DEG, speed: float = SPEED) -> Push:
     """Move a plate through a bed, so many cells to a side of the plate."""
-    scene, surface = bed(cells), DEPTH * SIDE
-    turn = about_y(motion.lean_deg)
+    scene, surface = bed(cells).scene(), DEPTH * SIDE
+    turn = about("y", motion.lean_deg)
     way = np.array([motion.way[0], 0, motion.way[1]])
     begin = np.array([0, 0, surface - motion.depth * SIDE])
 
     def pose(travel: float) -> tuple[np.ndarray, np.ndarray]:
         return (begin + travel * way)[None], turn[None]
 
-    state = with_sand(started(scene), friction_deg=friction_deg)
+    state = with_sand(bed(cells).start(), friction_deg=friction_deg)
     lean = np.radians(motion.lean_deg)
     x, y, z = scene.world(state.grains.x)
     in_plane = np.cos(lean) * x - np.sin(lean) * (z - begin[2])
@@ -118,8 +102,8 @@ def push(cells: int, motion: Motion, friction_deg: float = FRICTION_DEG, speed: 
     inside = (abs(in_plane) < SIDE / 2) & (y < SIDE / 2) & (abs(off_plane) < THICK * SIDE / 2)
     state = planted(scene, at_rest(scene, without(state, inside), surface), *pose(0.0))
     steps = int((motion.travel * SIDE / speed + RAMP / 2) / RIGID_DT)
-    done = ride(scene, state, soft_travel(RIGID_DT * np.arange(1, 1 + steps), speed, RAMP), pose, 0)
-    whole = 2 * done.force[:, [0, 2]] / UNIT
+    done = ride(scene, state, soft_travel(RIGID_DT * np.arange(1, 1 + steps), speed, RAMP), pose)
+    whole = 2 * done.force(0)[:, [0, 2]] / UNIT
     force = np.stack([smooth(done.travel, f, SIDE / cells) for f in whole.T], axis=-1)
     travel = done.travel / SIDE
     return Push(travel, motion.depth - travel * motion.way[1], force, int(done.last.health), done.cpu_s)
@@ -132,27 +116,24 @@ PRESSED, HELD = 0.05, 0.5  # m/s, and s after it has halted
 
 
 @cache
-def footing_scene(half_width: float) -> Scene:
+def footing_bed(half_width: float) -> Bed:
     """A long footing over sand in plane strain, half as many cells wide; a node of the grid lies under its middle."""
     (across, deep), y, half = FOOTING_BED, FOOTING_WIDTH, half_width * FOOTING
-    config = {
-        "name": "footing",
-        "plane_strain": True,
-        "box": {"lower": (-across / 2, 0, 0), "upper": (across / 2, y, 1.5 * deep)},
-        "feature": 4 * FOOTING,
-        "duration": 1.0,
-        "speed": 1.0,
-        "grains": [
-            {"material": sand(FRICTION_DEG, E), "fill": [block((-across / 2, 0, 0), (across / 2, y, deep))]},
-        ],
-        "bodies": {
-            "mjcf": f"""<mujoco><worldbody><body mocap="true" pos="0 {y / 2} {deep}">
-              <geom name="footing" type="box" pos="0 0 .1" size="{half} {y} .1"/></body></worldbody></mujoco>""",
-            "couple": ["footing"],
-            "friction": FRICTION,
-        },
-    }
-    return build(SceneConfig(**config), Fidelity(cells=4, rigid_dt=RIGID_DT))
+    return Bed(
+        f"""<worldbody><body mocap="true" pos="0 {y / 2} {deep}">
+          <geom name="footing" type="box" pos="0 0 .1" size="{half} {y} .1"/></body></worldbody>""",
+        ("footing",),
+        (across, y, 1.5 * deep),
+        (((-across / 2, 0, 0), (across / 2, y, deep)),),
+        FOOTING,
+        2,
+        friction=FRICTION,
+        rigid_dt=RIGID_DT,
+        material=sand(FRICTION_DEG, E),
+        lower=(-across / 2, 0, 0),
+        walls={},
+        speed=1.0,
+    )
 
 
 class Footing(NamedTuple):
@@ -165,16 +146,16 @@ class Footing(NamedTuple):
 
 def footing(half_width: float, depth: float) -> Footing:
     """Press a footing in to a depth and hold it there; both in cells. The bed's surface is a plane of nodes."""
-    scene, deep = footing_scene(half_width), FOOTING_BED[1]
+    scene, deep = footing_bed(half_width).scene(), FOOTING_BED[1]
 
     def pose(travel: float) -> tuple[np.ndarray, np.ndarray]:
-        return np.array([[0, FOOTING_WIDTH / 2, deep - travel]]), about_y(0)[None]
+        return np.array([[0, FOOTING_WIDTH / 2, deep - travel]]), about("y", 0)[None]
 
-    state = planted(scene, at_rest(scene, started(scene), deep), *pose(0.0))
+    state = planted(scene, at_rest(scene, footing_bed(half_width).start(), deep), *pose(0.0))
     goal = depth * FOOTING
     times = RIGID_DT * np.arange(1, 1 + int((goal / PRESSED + RAMP + HELD) / RIGID_DT))
-    done = ride(scene, state, np.minimum(soft_travel(times, PRESSED, RAMP), goal), pose, 0)
-    return Footing(float(done.force[-10:, 2].mean()), int(done.last.health), done.cpu_s)
+    done = ride(scene, state, np.minimum(soft_travel(times, PRESSED, RAMP), goal), pose)
+    return Footing(float(done.force(0)[-10:, 2].mean()), int(done.last.health), done.cpu_s)
 
 
 def breakout(depth: float, friction_deg: float = FRICTION_DEG) -> float:

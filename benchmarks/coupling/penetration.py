@@ -2,8 +2,8 @@
 
     python -m benchmarks.coupling.penetration [--quick]
 
-Writes results/penetration.json, a case for each reference, and plots beside it. A case whose value lies outside the
-reference's band is told as a miss, with what is known about why.
+Writes results/coupling_penetration.json, a case for each reference, and plots into docs/coupling. A case whose value
+lies outside the reference's band is told as a miss, with what is known about why.
 """
 
 from __future__ import annotations
@@ -15,13 +15,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks import job, results
+from benchmarks import job, machine, results
 from benchmarks.clock import significant
 from benchmarks.coupling import cutting, impact, intrusion
-from benchmarks.coupling.beds import line
+from benchmarks.coupling.fits import line
 from benchmarks.coupling.intrusion import ALONG_FLAT, ALONG_UPRIGHT, DOWN, UP, UP_DEEPER
 from benchmarks.coupling.picture import Series, plot
 
+PLOTS = machine.ROOT / "docs" / "coupling"
 Band = tuple[float, float]  # the values that agree with a reference
 FRICTIONS = (20.0, 25.0, 30.0, 35.0, 40.0)  # degrees
 UEHARA, BRZINSKI, RFT = "Uehara et al. 2003", "Brzinski et al. 2013", "Li, Zhang & Goldman 2013"
@@ -98,7 +99,7 @@ def balls(cells: tuple[int, ...]) -> list[Case]:
     fall = np.geomspace(0.08, 1.0, 20)
     law = 0.14 / impact.REPOSE * np.sqrt(impact.RATIOS[1]) * impact.SIZE ** (2 / 3) * fall ** (1 / 3)
     plot(
-        results.FOLDER / "penetration_balls.png",
+        PLOTS / "penetration_balls.png",
         f"A ball {impact.RATIOS[1]:g} times as dense as sand, {impact.SIZE:g} m across",
         "whole fall, m",
         "depth, m",
@@ -177,7 +178,7 @@ def plates(cells: int) -> list[Case]:
             case(f"down over up, {at}", RFT, 4, (3, 5), pressed / pull, p, down),
         ]
     plot(
-        results.FOLDER / "penetration_plates.png",
+        PLOTS / "penetration_plates.png",
         "A square plate pushed down, and dragged at a depth of its side",
         "depth of the first, travel of the others, over the side",
         "force / rho g side^3",
@@ -201,7 +202,7 @@ def walls(cells: int) -> list[Case]:
 
     lines = [Series("", [0, 0.1], [cutting.passive(phi)] * 2, True, k) for k, phi in enumerate(done)]
     plot(
-        results.FOLDER / "penetration_walls.png",
+        PLOTS / "penetration_walls.png",
         f"A smooth wall pushed into sand {cells} cells deep; straight lines: Rankine",
         "travel / depth",
         "K",
@@ -231,7 +232,7 @@ def blades(cells: int) -> list[Case]:
         series.append(Series(f"{blade}, rake {rake:.0f}", FRICTIONS, [c.resistance for c in done], colour=k))
         series.append(Series("", FRICTIONS, laws, joined=True, colour=k))
     plot(
-        results.FOLDER / "penetration_blades.png",
+        PLOTS / "penetration_blades.png",
         f"Blades through sand {cells} cells deep; lines: the earth-moving equation",
         "friction angle, degrees",
         "N",
@@ -258,12 +259,12 @@ def dropped(quick: bool) -> list[Case]:
 
 
 def main() -> None:
-    """Measure all and write results/penetration.json."""
+    """Measure all and write results/coupling_penetration.json."""
     parser = argparse.ArgumentParser(description="Bodies that go into sand, against experiments and limit theorems.")
     parser.add_argument("--quick", action="store_true", help="coarser: a few minutes")
     quick = parser.parse_args().quick
     job.pin(1)
-    results.FOLDER.mkdir(exist_ok=True)
+    PLOTS.mkdir(parents=True, exist_ok=True)
     cells = 8 if quick else 32
     told: list[dict[str, Any]] = []
     for cases in (
@@ -277,7 +278,7 @@ def main() -> None:
             value, reference = case["value"], case["reference"]
             print(f"{case['verdict']:7}{case['name']:50}{value:9.4g}{reference:9.4g}  {case['resolution']}", flush=True)
             told.append(case)
-    results.write("penetration", {"quick": quick, "cases": told})
+    results.write("coupling_penetration", {"quick": quick, "cases": told})
 
 
 if __name__ == "__main__":

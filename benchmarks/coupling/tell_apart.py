@@ -2,6 +2,8 @@
 
 A dropped box hardly does: it is caught by the light nodes above the bed. In plane strain; bodies are 100 times as light
 as their volume of sand, unless said.
+
+    python -m benchmarks.coupling.tell_apart [--quick]
 """
 
 from __future__ import annotations
@@ -10,13 +12,16 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.coupling.scenes import Bed, Steps, lighter, run, trouble
+from benchmarks.coupling import part
+from benchmarks.coupling.beds import lighter
+from benchmarks.coupling.part import Band, kept
+from benchmarks.coupling.scenes import Bed, Steps, run, trouble
 from coupling import meeting
 from coupling.contact import Points, Surface
 from coupling.exchange import Exchange, Twists, exchange
@@ -26,6 +31,17 @@ DX = 0.025  # m
 WIDE = 0.1  # m, of the slice
 MID = WIDE / 2
 LAST = 50  # rigid steps at the end, over which forces are looked at
+
+STEPS = 250  # rigid steps, a second
+ASTRAY_STEPS = 100  # of a negative control, which has been thrown about by then
+OURS = "together"
+BANDS = (
+    Band("fastest", 0.0, 0.5, where={"scheme": OURS, "told": False}),
+    Band("fastest", 0.0, 4.0, where={"scheme": OURS, "told": True}),
+    Band("noise", 0.0, 0.1, where={"scheme": OURS}),
+    Band("astray_cells", 0.0, 0.01, where={"scheme": OURS}),
+    Band("unpaid", 0.0, 1e-6, where={"scheme": OURS}),
+)
 
 BOX = f'<geom name="box" type="box" size=".1 {MID} .05" density="1500"/>'
 # MuJoCo's contacts are as soft as a body is light: its default lets sand press a box of foam centimetres into a floor.
@@ -176,3 +192,35 @@ def told_apart(name: str, scheme: Callable[..., Exchange] | None = None, count: 
         return held(scene, state, count)[0]
     with control(scheme):
         return held(replace(scene, kernels="xla"), state, count)[0]
+
+
+CONTROLS: dict[str, Callable[..., Exchange]] = {"explicit": explicit, "staggered": staggered}
+UNDER_CONTROL = "buried"
+
+
+def measure(quick: bool) -> dict[str, Any]:
+    """All scenes by our scheme, and one by the negative controls."""
+    jobs = [(name, OURS) for name in SCENES] + [(UNDER_CONTROL, scheme) for scheme in CONTROLS]
+    rows = []
+    for name, scheme in jobs:
+        count = (STEPS if scheme == OURS else ASTRAY_STEPS) // (2 if quick else 1)
+        done = told_apart(name, CONTROLS.get(scheme), count)
+        row = {
+            "name": name,
+            "scheme": scheme,
+            "told": name == "light arm",
+            "ratio": SCENES[name][1],
+            "seconds": count * 0.004,
+            "fastest": kept(done.fastest),
+            "force_N": kept(done.force),
+            "noise": kept(done.noise),
+            "astray_cells": kept(done.astray),
+            "unpaid": kept(done.unpaid),
+            "trouble": done.trouble,
+        }
+        rows.append(part.say(row))
+    return {"rows": rows, "bands": part.told(BANDS)}
+
+
+if __name__ == "__main__":
+    part.main("tell_apart", measure, __doc__)

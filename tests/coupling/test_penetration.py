@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from benchmarks.coupling import cutting, impact, intrusion
-from benchmarks.coupling.beds import line
+from benchmarks.coupling.fits import line
 from mpm_env.health import Health
 
 # Walls and blades, in plane strain.

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from benchmarks.coupling import tell_apart as ta
-from benchmarks.coupling.scenes import RHO, G, lighter, run
+from benchmarks.coupling.beds import RHO, G, lighter
+from benchmarks.coupling.scenes import run
 
 STEPS = 250  # rigid steps, a second
 CALM = 0.5  # m/s or rad/s of what is not told to move; 0.26 observed, while sand falls against the gate
