@@ -14,7 +14,7 @@ RIGHT_VERSION := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3,
 WILL_DO := import ensurepip, venv; $(RIGHT_VERSION)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo bench guard test test-xla test-fast lint format pins clean
+.PHONY: help setup demo bench guard coupling test test-xla test-fast lint format pins clean
 
 help:  ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /\1: /p' $(MAKEFILE_LIST) | awk -F': ' '{ printf "  make %-10s %s\n", $$1, $$2 }'
@@ -29,6 +29,9 @@ bench: $(READY)  ## all benchmarks, into docs/performance.md (ARGS=--quick; PEER
 
 guard: $(READY)  ## has a substep become slower than the ratio kept? (ARGS=--keep keeps this run's)
 	$(BIN)/python -m benchmarks.guard $(ARGS)
+
+coupling: $(READY)  ## contact measured, into docs/coupling.md (ARGS=--quick; ARGS="drop blade" runs some parts)
+	$(BIN)/python -m benchmarks.coupling $(ARGS)
 
 test: $(READY)  ## all tests, a process per core
 	$(BIN)/python -m pytest -n auto --dist loadfile $(ARGS)
@@ -56,7 +59,7 @@ pins: $(READY)  ## resolve the newest allowed versions into constraints.txt
 	mv constraints.new constraints.txt
 
 clean:  ## remove what the other targets made, .venv too
-	rm -rf $(VENV) .cache .mypy_cache .pytest_cache .ruff_cache .hypothesis build dist demo_out
+	rm -rf $(VENV) .cache .mypy_cache .pytest_cache .ruff_cache .hypothesis build dist demo_out coupling_out
 
 # A .venv made by hand is kept and brought to the pinned versions; one that does not run is made anew. The build
 # tools come first, so that they are pinned like the rest and the package builds without a second environment.

@@ -105,7 +105,7 @@ def balls(cells: tuple[int, ...]) -> list[Case]:
         "depth, m",
         [Series(UEHARA, fall, law, joined=True), *series],
         log=True,
-        names_below=True,
+        names="below",
     )
     return out
 
@@ -210,7 +210,7 @@ def walls(cells: int) -> list[Case]:
             *(Series(f"phi {phi:.0f}", c.travel, 2 * c.draft, True, k) for k, (phi, c) in enumerate(done.items())),
             *lines,
         ],
-        names_below=True,
+        names="below",
     )
     same = slow.pressure / done[30.0].pressure
     return [

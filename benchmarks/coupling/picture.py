@@ -12,6 +12,7 @@ from PIL import Image, ImageDraw, ImageFont
 SIZE = (640, 440)  # pixels
 EDGE = (74, 34, 20, 52)  # pixels left, above, right and below of the axes
 COLOURS = ("#1b6ca8", "#c8553d", "#3a7d44", "#8e5ea2", "#b8860b", "#555555", "#d1478c", "#12908e")
+MANY = 4  # decades, from which on ticks are at powers of ten alone
 INK, PALE = "#222222", "#dddddd"
 
 
@@ -26,9 +27,12 @@ class Series(NamedTuple):
 
 
 def plot(
-    path: Path, title: str, x: str, y: str, series: Sequence[Series], *, log: bool = False, names_below: bool = False
+    path: Path, title: str, x: str, y: str, series: Sequence[Series], *, log: bool = False, names: str = "above"
 ) -> None:
-    """Write a plot; axes named x and y, both logarithmic where asked for; names of series above or below."""
+    """Write a plot; axes named x and y, both logarithmic where asked for.
+
+    Names of series stand "above" at the left, or at the right in the "middle" or "below".
+    """
     scale = np.log10 if log else np.asarray
     points = [np.stack([scale(np.asarray(a, float)) for a in (s.x, s.y)]) for s in series]
     low, high = (f(np.concatenate(points, axis=1), axis=1) for f in (np.min, np.max))
@@ -55,7 +59,8 @@ def plot(
     draw.text(((left + right) / 2, SIZE[1] - 8), x, fill=INK, font=font, anchor="mb")
     draw.text((8, 8), y, fill=INK, font=font, anchor="lt")
     named = [s.name for s in series if s.name]
-    first = bottom - 10 - 16 * len(named) if names_below else top + 8
+    rooms = {"above": top + 8, "middle": (top + bottom) / 2 - 8 * len(named), "below": bottom - 10 - 16 * len(named)}
+    first, right_hand = rooms[names], names != "above"
     for k, (s, at) in enumerate(zip(series, points, strict=True)):
         colour, spots = COLOURS[(k if s.colour is None else s.colour) % len(COLOURS)], place(at)
         if s.joined:
@@ -63,7 +68,7 @@ def plot(
         for u, v in [] if s.joined else spots:
             draw.ellipse([u - 4, v - 4, u + 4, v + 4], fill=colour)
         if s.name:
-            spot, anchor = ((right - 10, 0), "rt") if names_below else ((left + 10, 0), "lt")
+            spot, anchor = ((right - 10, 0), "rt") if right_hand else ((left + 10, 0), "lt")
             draw.text((spot[0], first + 16 * named.index(s.name)), s.name, fill=colour, font=font, anchor=anchor)
     image.save(path, optimize=True)
 
@@ -71,7 +76,8 @@ def plot(
 def _ticks(low: float, high: float, log: bool) -> list[float]:
     """Round numbers between the ends of an axis."""
     if log:
-        rounds = [m * 10.0**e for e in range(int(np.floor(low)), int(np.ceil(high)) + 1) for m in (1, 2, 5)]
+        steps = (1, 2, 5) if high - low < MANY else (1,)
+        rounds = [m * 10.0**e for e in range(int(np.floor(low)), int(np.ceil(high)) + 1) for m in steps]
         return [t for t in rounds if low <= np.log10(t) <= high]
     step = 10.0 ** np.floor(np.log10(high - low))
     step *= next(m for m in (0.1, 0.2, 0.5, 1, 2, 5) if (high - low) / (m * step) <= 8)
