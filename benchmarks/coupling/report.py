@@ -14,6 +14,7 @@ from benchmarks.coupling.words import DROP, HEAD, LIGHT, LIMITS, MEASURES, PENET
 from benchmarks.report import table
 
 OUT = machine.ROOT / "docs" / "coupling.md"
+FORMATS = {"weight": "{:.3f}", "rests_cells": "{:.2f}", "scatter_cells": "{:.2f}"}  # where two digits say too little
 PLOTS = ("walls", "blades", "plates", "balls")
 
 
@@ -33,19 +34,16 @@ def span(values: Iterable[float | None], how: Callable[[float | None], str] = br
     return low if low == high else f"{low} to {high}"
 
 
-def marked(text: str, missed: bool) -> str:
+def marked(text: str, outside: bool) -> str:
     """Text that stands out where a band is missed."""
-    return f"**{text}** (missed)" if missed else text
-
-
-FORMATS = {"weight": "{:.3f}", "rests_cells": "{:.2f}", "scatter_cells": "{:.2f}"}  # where two digits say too little
+    return f"**{text}** (missed)" if outside else text
 
 
 def seen(result: Row, rows: Sequence[Row], measure: str) -> str:
     """A measure over some rows, marked where one of them lies outside its band."""
-    missed = any(b.misses(row) for b in bands_of(result) if b.measure == measure for row in rows)
+    outside = any(b.misses(row) for b in bands_of(result) if b.measure == measure for row in rows)
     how = FORMATS[measure].format if measure in FORMATS else brief
-    return marked(span((row[measure] for row in rows), how), missed)
+    return marked(span((row[measure] for row in rows), how), outside)
 
 
 def troubled(rows: Iterable[Row]) -> str:
@@ -161,7 +159,7 @@ def blade(r: Row) -> str:
         some = [x for x in flat if x["thick_cells"] == thick]
         cells = [_force(some, s, band) for s in stretches]
         over = span((x["over_reference"][s] for x in some for s in stretches), lambda v: f"{v:.2f}")
-        rows.append([f"{thick:g} cells thick", *cells, over, seen(r, some, "leaked"), troubled(some)])
+        rows.append([_thick(some[0]), *cells, over, seen(r, some, "leaked"), troubled(some)])
     offsets = ", ".join(f"{o:g}" for o in dict.fromkeys(x["offset"] for x in flat))
     text = (
         "10 cm deep, 0.3 m/s. The force in N per metre of width, averaged over stretches of the way, with its spread"
@@ -181,7 +179,11 @@ def blade(r: Row) -> str:
     )
     head = ["yaw, degrees", "offset, cells", f"force along the way, N/m, {stretch}", MEASURES["leaked"], "health"]
     text += table(head, rows)
-    return text + "\n" + bounds(r) + missed(r, lambda row: f"{row['thick_cells']:g} cells thick")
+    return text + "\n" + bounds(r) + missed(r, _thick)
+
+
+def _thick(row: Row) -> str:
+    return f"{row['thick_cells']:g} cell{'s' * (row['thick_cells'] != 1)} thick"
 
 
 def _force(rows: Sequence[Row], stretch: str, band: Band) -> str:
