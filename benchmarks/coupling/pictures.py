@@ -28,11 +28,14 @@ from benchmarks.coupling.scenes import Steps, ride, run
 from benchmarks.coupling.slices import LARGE, Panel, Window, draw, letters
 from mpm_env import Scene, State, build, load_fidelity, read_scene
 from mpm_env.log import Recorder
+from mpm_env.render import Camera
 from mpm_env.run import recipe
 from mpm_env.view import View, camera_of, no_reactions, write_frame
 
 DOCS = machine.ROOT / "docs" / "coupling"
 EVERY = 5  # rigid steps in a frame: 50 frames a second
+WAY = 0.15  # m, of the blades
+FRONT = Camera((1.05, -0.42, 0.62), (0.42, 0.1, 0.14), 34.0)  # looks at the face that pushes
 CAPTION = 30  # pixels under a picture
 COLOURS = 128  # of a picture in space: few enough for a small file
 
@@ -83,7 +86,7 @@ def boxes(out: Path, quick: bool) -> dict[str, str]:
         height[first.slots] = first.grains[:, 2]
         fell = 100 * (first.poses[-1, 2] - last.poses[-1, 2])
         panels.append(
-            Panel(f"{ratio:g} times as dense", last, height[last.slots], f"{fell:.1f} cm down after {last.time:g} s")
+            Panel(f"{ratio:g} of sand's density", last, height[last.slots], f"{fell:.1f} cm down after {last.time:g} s")
         )
     window = Window((0.15, 0.65), (0.0, 0.36), 420)
     draw(DOCS / "drop.png", panels, window, (0.0, 0.2), "height of the grains before the fall, m")
@@ -93,7 +96,7 @@ def boxes(out: Path, quick: bool) -> dict[str, str]:
 def buried(out: Path, quick: bool) -> dict[str, str]:
     """A light box buried in sand, by our scheme and by the negative controls; and how fast it moves."""
     base, when = tell_apart.buried().scene(), 0.1
-    ratio = tell_apart.SCENES["buried"][1]
+    ratio, window = tell_apart.SCENES["buried"][1], Window((0.0, 0.6), (0.0, 0.4), 500)
     state, panels, series = lighter(started(base), ratio), [], []
     names = {
         "together": "solved together",
@@ -113,10 +116,10 @@ def buried(out: Path, quick: bool) -> dict[str, str]:
         time = scene.rigid_dt * (1 + np.arange(len(speed)))
         series.append(Series(names[name], time[speed > 0], speed[speed > 0], joined=True))
         at = film.views[round(when / scene.rigid_dt)]
+        gone = "" if 0 < at.poses[-1, 2] < window.z[1] else ", out of sight"
         panels.append(
-            Panel(names[name], at, at.speed, f"after {at.time:g} s; box: up to {brief(speed[:25].max())} m/s")
+            Panel(names[name], at, at.speed, f"after {at.time:g} s; box: up to {brief(speed[:25].max())} m/s{gone}")
         )
-    window = Window((0.0, 0.6), (0.0, 0.4), 500)
     draw(DOCS / "buried.png", panels, window, (0.0, 0.5), "speed of the grains, m/s")
     plot(
         DOCS / "buried_speed.png",
@@ -142,12 +145,12 @@ def blades(out: Path, quick: bool) -> dict[str, str]:
         some, pose = blade.bed(thick, dx), blade.pose_of(blade.bed(thick, dx), 0.0, 0.0)
         state = blade.ready(some, thick, pose)
         with filmed(out / f"blade_{k}.rrd", some.scene(), state, title) as film:
-            done = ride(some.scene(), state, blade.way(some, 0.2), pose, rows=EVERY, look=film.look)
+            done = ride(some.scene(), state, blade.way(some, WAY), pose, rows=EVERY, look=film.look)
         at = film.views[-1]
         note = f"{1000 * thick:g} mm thick, cells of {1000 * dx:g} mm, after {100 * done.travel[-1]:.0f} cm at 0.3 m/s"
         panels.append(Panel(title, at, at.speed, note))
     draw(DOCS / "blade.png", panels, Window((0.0, 0.8), (0.0, 0.36), 800), (0.0, 0.3), "speed of the grains, m/s", 1)
-    return {"blade": "A blade of half a cell after 20 cm of its way, above one that a fine grid resolves."}
+    return {"blade": "A blade of half a cell on its way through a bed, above one that a fine grid resolves."}
 
 
 def turned(out: Path, quick: bool) -> dict[str, str]:
@@ -157,9 +160,10 @@ def turned(out: Path, quick: bool) -> dict[str, str]:
     pose = blade.pose_of(some, 0.0, 20.0)
     state = blade.ready(some, thick, pose)
     with filmed(out / "blade_turned.rrd", some.scene(), state, "a blade turned by 20 degrees") as film:
-        ride(some.scene(), state, blade.way(some, 0.2), pose, rows=EVERY, look=film.look)
-    strip(DOCS / "blade_turned.png", [film.views[0], film.views[-1]], ["at the start", "after 20 cm"])
-    return {"blade_turned": "A blade of half a cell, turned by 20 degrees, before and after 20 cm of its way."}
+        done = ride(some.scene(), state, blade.way(some, WAY), pose, rows=EVERY, look=film.look)
+    words = ["at the start", f"after {100 * done.travel[-1]:.0f} cm"]
+    strip(DOCS / "blade_turned.png", [film.views[0], film.views[-1]], words, camera=FRONT)
+    return {"blade_turned": "A blade of half a cell, turned by 20 degrees, before and on its way through a bed."}
 
 
 def bucket(out: Path, quick: bool) -> dict[str, str]:
@@ -168,22 +172,24 @@ def bucket(out: Path, quick: bool) -> dict[str, str]:
     state, every = started(scene), round(0.04 / scene.rigid_dt)
     with filmed(out / "bucket.rrd", scene, state, scene.config.name, every=every, prepared=False) as film:
         run(scene, state, round(scene.config.duration / scene.rigid_dt), rows=every, look=film.look)
-    times = (0.6, 1.2, 1.6, 2.6)
+    times = (0.6, 1.2, 1.6, 2.0)
     shown = [film.views[round(t / 0.04)] for t in times]
     what = ("going in", "driven ahead", "curled up", "lifted")
     strip(DOCS / "bucket.png", shown, [f"{t:g} s: {word}" for t, word in zip(times, what, strict=True)])
     return {"bucket": "A bucket, a concave mesh, digs and lifts sand (`examples/a3_mesh_bucket.py`)."}
 
 
-def strip(path: Path, views: Sequence[View], captions: Sequence[str], columns: int = 2) -> None:
-    """Pictures in space with a caption under each."""
+def strip(
+    path: Path, views: Sequence[View], captions: Sequence[str], columns: int = 2, *, camera: Camera | None = None
+) -> None:
+    """Pictures in space with a caption under each, by the scene's own camera or another."""
     w, h = 480, 320
     rows = -(-len(views) // columns)
     sheet = Image.new("RGB", (columns * w + 8 * (columns - 1), rows * (h + CAPTION)), "white")
     pen = ImageDraw.Draw(sheet)
     for k, (view, caption) in enumerate(zip(views, captions, strict=True)):
         x, y = (k % columns) * (w + 8), (k // columns) * (h + CAPTION)
-        sheet.paste(Image.fromarray(view.picture(width=w, height=h, samples=2)), (x, y))
+        sheet.paste(Image.fromarray(view.picture(width=w, height=h, samples=2, camera=camera)), (x, y))
         pen.text((x + w / 2, y + h + 7), caption, fill=INK, font=letters(LARGE), anchor="mt")
     sheet.quantize(COLOURS, dither=Image.Dither.NONE).save(path, optimize=True)
 
