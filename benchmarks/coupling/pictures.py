@@ -35,7 +35,7 @@ from mpm_env.view import View, camera_of, no_reactions, write_frame
 DOCS = machine.ROOT / "docs" / "coupling"
 EVERY = 5  # rigid steps in a frame: 50 frames a second
 WAY = 0.15  # m, of the blades
-FRONT = Camera((1.05, -0.42, 0.62), (0.42, 0.1, 0.14), 34.0)  # looks at the face that pushes
+FRONT = Camera((1.22, -0.56, 0.72), (0.4, 0.1, 0.19), 34.0)  # looks at the face that pushes
 CAPTION = 30  # pixels under a picture
 COLOURS = 128  # of a picture in space: few enough for a small file
 
@@ -86,7 +86,7 @@ def boxes(out: Path, quick: bool) -> dict[str, str]:
         height[first.slots] = first.grains[:, 2]
         fell = 100 * (first.poses[-1, 2] - last.poses[-1, 2])
         panels.append(
-            Panel(f"{ratio:g} of sand's density", last, height[last.slots], f"{fell:.1f} cm down after {last.time:g} s")
+            Panel(f"density ratio {ratio:g}", last, height[last.slots], f"{fell:.1f} cm down after {last.time:g} s")
         )
     window = Window((0.15, 0.65), (0.0, 0.36), 420)
     draw(DOCS / "drop.png", panels, window, (0.0, 0.2), "height of the grains before the fall, m")
