@@ -13,7 +13,7 @@ from pathlib import Path
 
 from benchmarks import machine
 
-PARTS = ("tell_apart", "drop", "blade", "penetration", "pictures")
+PARTS = ("tell_apart", "drop", "blade", "penetration", "refined", "cost", "pictures")
 
 
 def main() -> None:

@@ -10,7 +10,19 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from benchmarks import machine, results
 from benchmarks.coupling.part import Band, Row, bands_of, misses
-from benchmarks.coupling.words import DROP, HEAD, LIGHT, LIMITS, MEASURES, PENETRATION, SCENES, SCHEME, SCHEMES
+from benchmarks.coupling.words import (
+    COST,
+    DROP,
+    HEAD,
+    LIGHT,
+    LIMITS,
+    MEASURES,
+    PENETRATION,
+    REFINED,
+    SCENES,
+    SCHEME,
+    SCHEMES,
+)
 from benchmarks.report import table
 
 OUT = machine.ROOT / "docs" / "coupling.md"
@@ -225,11 +237,49 @@ def penetration(r: Row) -> str:
     return text + "\n" + table(plots[:2], rows) + "\n"
 
 
+def refined(r: Row) -> str:
+    """How little the cut of time matters."""
+    told = {"16": "16", "4": "4", "1": "1", "half": "16, half as long"}
+    rows = [
+        [
+            row["name"],
+            told[row["how"]],
+            f"{row['impulse_N_s']:.4g}",
+            seen(r, [row], "impulse_off"),
+            seen(r, [row], "way_off"),
+            troubled([row]),
+        ]
+        for row in r["rows"]
+    ]
+    head = ["scene", "substeps a rigid step", "impulse of the sand, N s", "impulse, off by", "way, off by", "health"]
+    return REFINED + table(head, rows) + "\n" + bounds(r) + missed(r, lambda row: str(row["name"])) + "\n"
+
+
+def cost(r: Row) -> str:
+    """What bodies cost on top of grains."""
+    ways = {"alone": "alone", "map": f"{r['envs']}, mapped", "vmap": f"{r['envs']}, vmapped"}
+    rows = [
+        [
+            fidelity,
+            row["grains"],
+            told,
+            "{median:.2f} [{min:.2f}, {max:.2f}]".format(**row[way]["share"]),
+            brief(row[way]["ms_per_rigid_step"]),
+        ]
+        for fidelity, row in r["dig"].items()
+        for way, told in ways.items()
+    ]
+    head = ["fidelity", "slots for grains", "environments", "bodies on top of grains", "ms per rigid step, at least"]
+    return COST + table(head, rows) + "\n"
+
+
 SECTIONS: dict[str, tuple[str, Callable[[Row], str], tuple[str, ...]]] = {  # part -> title, text, pictures
     "tell_apart": ("Light bodies that sand holds", tell_apart, ("buried", "buried_speed")),
     "drop": ("A dropped box", drop, ("drop",)),
     "blade": ("A blade through a bed", blade, ("blade", "blade_turned")),
     "penetration": ("Into sand, against experiments", penetration, ()),
+    "refined": ("However time is cut", refined, ()),
+    "cost": ("What it costs", cost, ()),
     "pictures": ("A mesh digs", lambda r: "", ("bucket",)),
 }
 

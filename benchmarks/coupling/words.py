@@ -89,4 +89,20 @@ MEASURES = {  # how a number is called
     "leaked": "passed / swept",
     "over_reference": "force / the reference's",
     "ratio": "density ratio",
+    "impulse_off": "impulse, off by",
+    "way_off": "way, off by",
 }
+
+REFINED = """\
+Half a second in plane strain, cells of 25 mm: a box as dense as sand falls 5 cm on a bed; a heavy arm presses its
+paddle into one. Time is cut into rigid steps of 16, 4 and 1 substeps, and of 16 substeps half as long. `Off` is the
+share by which the sand's impulse and the body's way differ from those of the first row.
+
+"""
+
+COST = """\
+CPU time of rigid steps with the bucket in the bed (`bucket_dig`) beyond that of the same grains' substeps without any
+body, over the latter; alone and in a batch of environments; least and most of five rounds in brackets.
+`docs/performance.md` has the stages it comes from.
+
+"""
