@@ -34,7 +34,8 @@ def points_near(
         if not mine:
             continue
         lows, highs = np.asarray([_box_around(b, d, i) for i in mine]).swapaxes(0, 1)
-        axes = [np.arange(lo, hi + step, step) for lo, hi in zip(lows.min(0) - high, highs.max(0) + high, strict=True)]
+        ends = zip(lows.min(0) - high, highs.max(0) + high, strict=True)
+        axes = [np.arange(lo + step / 2, hi + step / 2, step) for lo, hi in ends]  # middles, so none lies on the edge
         if middle is not None:
             axes[1] = np.asarray([middle])
         phi = distances_from(b, d, mine, np.stack(np.meshgrid(*axes, indexing="ij")).reshape(3, -1))

@@ -330,6 +330,17 @@ def test_points_near_a_ball_fill_its_shell() -> None:
     assert points_near(b, bands, 0.01, middle=0.5) == (0, 0)
 
 
+@pytest.mark.parametrize("thick", [0.1, 0.5, 1.0, 2.0])
+def test_points_near_a_plate_along_the_axes_fill_its_shell(thick: float) -> None:
+    """No layer is lost on the edge of the band: its volume is counted, within the lattice's half cells."""
+    dx, wide = 0.01, 0.2
+    size = f"{thick * dx / 2} {wide / 2} {wide / 2}"
+    body = f'<body mocap="true"><geom name="plate" type="box" size="{size}"/></body>'
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
+    (count,) = points_near(coupled(model, "plate"), ((-2 * dx, 0.5 * dx),), dx)
+    assert count >= 0.95 * (thick + 1) * (wide / dx) ** 2
+
+
 def test_points_near_bodies_add_up_and_planes_count_as_none() -> None:
     model = model_of(TOOL)
     band = ((-0.02, 0.02),)
