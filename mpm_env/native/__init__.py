@@ -32,6 +32,9 @@ def why_not() -> str | None:
     if jax.default_backend() != "cpu":
         return f"they are for the CPU, and JAX runs on {jax.default_backend()}"
     if not LIBRARY.exists():
+        reason = LIBRARY.with_suffix(".txt")  # build.py leaves it
+        if reason.exists():
+            return f"they were not built ({reason.read_text().strip()}): mend that, then install the package again"
         return "they were not built: install a C++ compiler, then the package again"
     try:
         library = ctypes.CDLL(str(LIBRARY))

@@ -71,9 +71,20 @@ def build(library: Path) -> str | None:
             _run([*compiler, "-shared", "-pthread", *objects, "-o", f"{scratch}/{LIBRARY}"])
         except (OSError, subprocess.CalledProcessError) as error:
             said = (getattr(error, "stderr", None) or "it said nothing").strip().splitlines()
-            return f"{compiler[0]} failed: {said[-1]}"
+            return f"{compiler[0]} failed: {next((line for line in said if 'error' in line), said[-1])}"
         shutil.move(f"{scratch}/{LIBRARY}", library)
     return None
+
+
+def build_or_say(library: Path) -> str | None:
+    """Compile the library, or leave the reason why not in a text beside it, which this also returns."""
+    why_not, reason = build(library), library.with_suffix(".txt")
+    if why_not:
+        library.unlink(missing_ok=True)  # of other sources
+        reason.write_text(why_not + "\n")
+    else:
+        reason.unlink(missing_ok=True)
+    return why_not
 
 
 def _run(command: list[str]) -> None:
@@ -86,9 +97,9 @@ class Hook(BuildHookInterface):
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
         """Hatch calls this before it packs the wheel, or writes the editable one."""
         library = HERE / LIBRARY
-        why_not = build(library)
+        why_not = build_or_say(library)
         if why_not:
-            library.unlink(missing_ok=True)
+            build_data["artifacts"].append(f"mpm_env/native/{library.with_suffix('.txt').name}")
             self.app.display_warning(f"mpm-env is built without its native kernels: {why_not}.")
             return
         # It belongs to this kind of machine, but to any Python: it is loaded through ctypes.
@@ -104,4 +115,4 @@ def get_build_hook() -> type[BuildHookInterface]:
 
 
 if __name__ == "__main__":
-    raise SystemExit(build(HERE / LIBRARY))
+    raise SystemExit(build_or_say(HERE / LIBRARY))

@@ -3,6 +3,7 @@
 #pragma once
 #include <cstdint>
 #include <cstring>
+#include <utility>
 #if defined(__AVX512F__) && defined(__AVX512DQ__)
 #include <immintrin.h>
 #define NATIVE_BYTES 64
@@ -153,20 +154,23 @@ template <class S> INLINE Pack<S> expm1(Pack<S> x) {
   return part * power + (power - S(1));
 }
 
+// Rows x and y of a matrix, of which every other group of H lanes changes places; their new values by FROM_Y.
+template <bool FROM_Y, int H, class V, int... L> INLINE V exchanged(V x, V y, std::integer_sequence<int, L...>) {
+  constexpr int N = sizeof...(L);
+  return __builtin_shufflevector(x, y, (FROM_Y ? (L & H ? N + L : L + H) : (L & H ? N + L - H : L))...);
+}
+
 // A block of N parts as the rows of a matrix, transposed in place by halving.
-template <class S, int N> INLINE void transpose_block(typename Pack<S>::Part* r) {
-  typename Bits<S>::Part low, high;
-#pragma GCC unroll 4
-  for (int h = N / 2; h >= 1; h /= 2) {
-    for (int l = 0; l < N; ++l) { low[l] = l & h ? N + l - h : l; high[l] = l & h ? N + l : l + h; }
+template <class S, int N, int H = N / 2> INLINE void transpose_block(typename Pack<S>::Part* r) {
+  constexpr std::make_integer_sequence<int, N> lanes;
 #pragma GCC unroll 16
-    for (int i = 0; i < N; ++i)
-      if (!(i & h)) {
-        typename Pack<S>::Part x = r[i], y = r[i + h];
-        r[i] = __builtin_shuffle(x, y, low);
-        r[i + h] = __builtin_shuffle(x, y, high);
-      }
-  }
+  for (int i = 0; i < N; ++i)
+    if (!(i & H)) {
+      typename Pack<S>::Part x = r[i], y = r[i + H];
+      r[i] = exchanged<false, H>(x, y, lanes);
+      r[i + H] = exchanged<true, H>(x, y, lanes);
+    }
+  if constexpr (H > 1) transpose_block<S, N, H / 2>(r);
 }
 
 // Sixteen packs as the rows of a matrix, transposed in place.
