@@ -6,6 +6,8 @@
 
 namespace MPM_ISA {
 
+constexpr double TINY = 1e-30;  // keeps square roots and quotients finite at zero, as in linalg3.py
+
 // Symmetric tensors as in Particles.e: xx zz yy xz in plane strain (the third is out of plane), xx yy zz yz xz xy in 3-D.
 template <class S, int D> struct Sym {
   static constexpr int count = D == 3 ? 6 : 4;
@@ -33,7 +35,7 @@ template <class S, int D> struct Principal {
 // Cosine, sine and tangent of the Jacobi angle that removes the off-diagonal element pq.
 template <class S> INLINE void rotation(Pack<S> pp, Pack<S> qq, Pack<S> pq, Pack<S>& c, Pack<S>& s, Pack<S>& t) {
   Pack<S> d = qq - pp;
-  t = S(2) * pq / (d + with_sign(root(d * d + S(4) * pq * pq + S(1e-30)), d));
+  t = S(2) * pq / (d + with_sign(root(d * d + S(4) * pq * pq + S(TINY)), d));
   c = per_root(S(1) + t * t);
   s = c * t;
 }
@@ -163,7 +165,7 @@ template <class S, int D> struct Sand {
   INLINE void flow(Pack<S>& tr, Pack<S> norm2, Pack<S>& keep, Pack<S>& memory) const {
     Pack<S> trial = tr;
     if (cap >= 0) tr = tr + memory;
-    Pack<S> norm = root(norm2 + S(1e-30)), over = norm + slope * (tr - tip);
+    Pack<S> norm = root(norm2 + S(TINY)), over = norm + slope * (tr - tip);
     Bits<S> tension = tr >= tip;
     keep = select<S>(tension, Pack<S>(S(0)), S(1) - largest(over, S(0)) / norm);
     tr = select<S>(tension, Pack<S>(tip), tr);

@@ -7,6 +7,8 @@
 
 namespace MPM_ISA {
 
+constexpr double LEAST_SPEED2 = 1e-30;  // (m/s)^2, guards the direction of sliding at rest, as in substep.py
+
 // Which columns of nodes grains reach: per first column of a window, lowest and highest first node along the last axis.
 struct Reach { int32_t low = INT32_MAX, high = -1; };
 
@@ -208,7 +210,7 @@ template <class S, int D> struct Scatter {
     else if (kind == STICK) for (int i = 0; i < D; ++i) q[i] = S(0);
     else {
       const S inward = side == 0 ? S(1) : S(-1), into = std::max(-inward * q[a], S(0));
-      S speed2 = S(1e-30);
+      S speed2 = S(LEAST_SPEED2);
       for (int i = 0; i < D; ++i) if (i != a) speed2 += q[i] * q[i];
       const S keep = std::max(S(1) - S(t.grid.wall_friction[2 * a + side]) * into / root(speed2), S(0));
       for (int i = 0; i < D; ++i) q[i] = i == a ? q[i] + inward * into : q[i] * keep;
