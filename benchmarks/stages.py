@@ -59,7 +59,7 @@ class NoStress:
 
     history_start: ClassVar[tuple[float, ...]] = (0.0,)
 
-    def update(self, e: Array, history: Array) -> tuple[Array, Array, Array]:
+    def update(self, e: Array, history: Array, dt: Array) -> tuple[Array, Array, Array]:
         """Nothing to answer."""
         return e, history, e
 

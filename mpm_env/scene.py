@@ -141,7 +141,7 @@ def build(config: SceneConfig, fidelity: Fidelity) -> Scene:
         fidelity = fidelity.model_copy(update={"dimension": 2})
     grid = _grid(config, fidelity)
     d = grid.dimension
-    materials = tuple(material_of(g.material, fidelity, dtype) for g in config.grains)
+    materials = tuple(material_of(g.material, dtype, dimension=d, stiffness=fidelity.stiffness) for g in config.grains)
     fills = tuple(tuple(fill_of(f, config, grid, fidelity) for f in g.fill) for g in config.grains)
     spans, at = [], 0
     for some in fills:

@@ -63,7 +63,7 @@ class SandConfig(Section):
     nu: Annotated[float, Field(ge=0, lt=0.5)]
     rho: Positive  # kg/m^3
     friction_deg: Annotated[float, Field(ge=0, lt=90)]
-    friction_fit: Literal["triaxial", "plane_strain"] = "triaxial"
+    friction_fit: Literal["triaxial", "plane_strain", "mc2d"] = "triaxial"  # "mc2d": plane strain only
     cohesion: NotNegative = 0.0  # Pa
     volume_correction: bool = True
 
@@ -82,7 +82,71 @@ class SnowConfig(Section):
     Jp_min: Annotated[float, Field(gt=0, le=1)] = 0.8
 
 
-MaterialConfig = Annotated[ElasticConfig | SandConfig | SnowConfig, Field(discriminator="model")]
+class VonMisesConfig(Section):
+    """Metal-like solid with linear hardening."""
+
+    model: Literal["von_mises"]
+    about: str = ""
+    E: Positive  # Pa
+    nu: Annotated[float, Field(ge=0, lt=0.5)]
+    rho: Positive  # kg/m^3
+    yield_stress: Positive  # Pa, uniaxial
+    hardening: NotNegative = 0.0  # Pa
+
+
+class HerschelBulkleyConfig(Section):
+    """Viscoplastic mud, paste or foam."""
+
+    model: Literal["herschel_bulkley"]
+    about: str = ""
+    E: Positive  # Pa
+    nu: Annotated[float, Field(ge=0, lt=0.5)]
+    rho: Positive  # kg/m^3
+    yield_stress: NotNegative  # Pa, in shear
+    consistency: NotNegative  # Pa s^flow_index
+    flow_index: Annotated[float, Field(ge=0.1, le=10)] = 1.0
+
+
+class MuIConfig(Section):
+    """Granular flow with the friction mu(I)."""
+
+    model: Literal["mu_i"]
+    about: str = ""
+    E: Positive  # Pa
+    nu: Annotated[float, Field(ge=0, lt=0.5)]
+    rho: Positive  # kg/m^3, of the bed
+    mu_s: Positive
+    mu_2: Positive
+    I_0: Positive
+    grain_size: Positive  # m
+    grain_density: Positive  # kg/m^3, of a grain
+    volume_correction: bool = True
+
+    @model_validator(mode="after")
+    def _speeds_up(self) -> MuIConfig:
+        if not self.mu_s < self.mu_2:
+            raise ValueError(f"needs mu_s < mu_2, got {self.mu_s} and {self.mu_2}")
+        return self
+
+
+class CamClayConfig(Section):
+    """Cam-Clay snow or soil that hardens, softens and breaks."""
+
+    model: Literal["cam_clay"]
+    about: str = ""
+    E: Positive  # Pa
+    nu: Annotated[float, Field(ge=0, lt=0.5)]
+    rho: Positive  # kg/m^3
+    M: Positive
+    beta: NotNegative
+    xi: Positive
+    compaction: NotNegative
+
+
+MaterialConfig = Annotated[
+    ElasticConfig | SandConfig | SnowConfig | VonMisesConfig | HerschelBulkleyConfig | MuIConfig | CamClayConfig,
+    Field(discriminator="model"),
+]
 
 
 class ReliefConfig(Section):

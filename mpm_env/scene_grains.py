@@ -10,6 +10,7 @@ import numpy as np
 
 from mpm_env.fidelity import Fidelity
 from mpm_env.mpm.materials import MATERIALS, Material
+from mpm_env.mpm.materials.sand import IN_PLANE
 from mpm_env.mpm.seeding import Fill, Relief, fill_ball, fill_box, fill_cylinder
 from mpm_env.mpm.types import Grid
 from mpm_env.scene_config import BoxFill, CylinderFill, MaterialConfig, SceneConfig, SphereFill
@@ -28,11 +29,15 @@ def axes_of(d: int) -> list[int]:
     return [0, 2] if d == 2 else [0, 1, 2]
 
 
-def material_of(config: MaterialConfig, fidelity: Fidelity, dtype: Any) -> Material:
-    """A material of the solver, softened as the fidelity asks."""
+def material_of(config: MaterialConfig, dtype: Any, *, dimension: int, stiffness: float = 1.0) -> Material:
+    """A material of the solver, softened by a factor. Raises ValueError where 3-D does not know its friction fit."""
     values = config.model_dump(exclude={"model", "about"})
-    if config.model == "sand":  # its strength is friction; snow yields at critical strains, so E is its strength
-        values["E"] *= fidelity.stiffness
+    if config.model in ("sand", "mu_i"):  # strength is friction; snow yields at critical strains, so E is its strength
+        values["E"] *= stiffness
+    if dimension == 3 and values.get("friction_fit") == IN_PLANE:
+        raise ValueError(
+            f"friction_fit = {IN_PLANE!r} knows plane strain only: use 'plane_strain' in 3-D, or plane_strain: true."
+        )
     if "friction_deg" in values:
         values["friction"] = math.radians(values.pop("friction_deg"))
     leaves = {k: v if isinstance(v, str | bool) else jnp.asarray(v, dtype) for k, v in values.items()}

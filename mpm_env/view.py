@@ -16,6 +16,10 @@ TONES = {
     "sand": ((184, 142, 88), (236, 204, 150)),
     "snow": ((214, 224, 238), (248, 250, 253)),
     "elastic": ((96, 120, 92), (128, 156, 118)),
+    "von_mises": ((120, 126, 134), (158, 164, 172)),
+    "herschel_bulkley": ((110, 84, 66), (148, 118, 94)),
+    "mu_i": ((184, 142, 88), (236, 204, 150)),
+    "cam_clay": ((206, 214, 226), (240, 243, 248)),
 }
 TONE_SEED = 61_803  # not one that a scene would draw its grains from: places and colours would go together
 DRAWN_SHARE = 0.6  # radius of a drawn grain over the distance of grains: heaps look closed

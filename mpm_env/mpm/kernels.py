@@ -98,6 +98,11 @@ def _snow(m: Snow) -> tuple[int, tuple[Any, ...]]:
 LAWS: dict[type, Callable[[Any], tuple[int, tuple[Any, ...]]]] = {Elastic: _elastic, Sand: _sand, Snow: _snow}
 
 
+def knows(material: Material) -> bool:
+    """Whether the kernels have this material's law; sand that flows in the plane only is not theirs."""
+    return type(material) in LAWS and not (isinstance(material, Sand) and material.directions == 2)
+
+
 def _padded(nodes: Array) -> Array:
     """Nodes (*shape, d + 1) as the kernels lay them out."""
     if nodes.shape[-1] == 4:

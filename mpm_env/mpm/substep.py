@@ -104,7 +104,7 @@ def move(grid: Grid, bed: Bed, p: Particles, nodes: Array, dt: float | Array, ke
 
     if kernels == "xla":
         return reference(p, nodes, dt, bed.material)
-    if type(bed.material) in in_cpp.LAWS:
+    if in_cpp.knows(bed.material):
         return in_cpp.to_grains(grid, bed.material, span, p, nodes, dt, reference)
     return strain(bed, in_cpp.to_grains(grid, None, span, p, nodes, dt, reference), dt)
 
@@ -169,7 +169,7 @@ def strain(bed: Bed, p: Particles, dt: float | Array) -> Particles:
 
 
 def _answered(material: Material, p: Particles, dt: float | Array) -> Particles:
-    e, history, tau = material.update(stretch(p.e, dt * p.C), p.history)
+    e, history, tau = material.update(stretch(p.e, dt * p.C), p.history, dt)
     return replace(p, e=e, tau=tau, history=history)
 
 

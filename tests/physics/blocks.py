@@ -16,12 +16,24 @@ from mpm_env.mpm.transfer import CHUNK
 from mpm_env.mpm.types import MARGIN, Grid, Particles, Wall
 
 GRAVITY = 9.81  # m/s^2
+PATIENCE = 1e24  # s: what depends on the rate has then come to its slowest, rate-free answer
 
+# fmt: off
 PARAMETERS: dict[str, dict[str, float]] = {
     "elastic": {"E": 1e6, "nu": 0.3, "rho": 1550.0},
     "sand": {"E": 3.537e5, "nu": 0.3, "rho": 2200.0, "friction": np.deg2rad(30), "cohesion": 0.0},
     "snow": {"E": 1.4e5, "nu": 0.2, "rho": 400.0, "theta_c": 0.025, "theta_s": 0.0075, "xi": 10.0, "Jp_min": 0.5},
+    "von_mises": {"E": 1e6, "nu": 0.3, "rho": 1550.0, "yield_stress": 2e4, "hardening": 1e5},
+    "herschel_bulkley": {
+        "E": 1e5, "nu": 0.3, "rho": 1200.0, "yield_stress": 1e3, "consistency": 40.0, "flow_index": 0.5,
+    },
+    "mu_i": {
+        "E": 1e6, "nu": 0.3, "rho": 1500.0,
+        "mu_s": 0.38, "mu_2": 0.64, "I_0": 0.28, "grain_size": 5e-4, "grain_density": 2450.0,
+    },
+    "cam_clay": {"E": 1e6, "nu": 0.3, "rho": 300.0, "M": 1.2, "beta": 0.3, "xi": 3.0, "compaction": 0.05},
 }
+# fmt: on
 
 
 def example(name: str, dtype: str = "float32", **changes: float | str | bool) -> Material:
@@ -76,9 +88,9 @@ def spinning(sites: np.ndarray, omega: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 @jax.jit
-def update(material: Material, e: Array, history: Array) -> tuple[Array, Array, Array]:
-    """The material's answer e, history, tau to trial strains."""
-    return material.update(e, history)
+def update(material: Material, e: Array, history: Array, dt: float | Array = PATIENCE) -> tuple[Array, Array, Array]:
+    """The material's answer e, history, tau to trial strains, given all the time it wants if not less."""
+    return material.update(e, history, dt)
 
 
 @partial(jax.jit, static_argnums=0)

@@ -3,7 +3,7 @@
 Written from the papers for F (n, 3, 3), with plain numbers: no b, no component rows, no guards.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -49,7 +49,8 @@ def sand(F: np.ndarray, history: np.ndarray, material: Material, *, unshifted: b
     U, S, _ = np.linalg.svd(F)
     lam, mu = lame(given["E"], given["nu"])
     sin, K = np.sin(given["friction"]), lam + 2 * mu / 3
-    alpha = np.sqrt(2 / 3) * 2 * sin / (3 - sin)
+    plane_strain = vars(material)["friction_fit"] == "plane_strain"
+    alpha = np.sqrt(2) * sin / 3 if plane_strain else np.sqrt(2 / 3) * 2 * sin / (3 - sin)
     tip = given["cohesion"] / np.tan(given["friction"]) / K
     vc = history[0][:, None]
     log_S = np.log(S)
@@ -81,7 +82,92 @@ def snow(F: np.ndarray, history: np.ndarray, material: Material) -> Answer:
     return Answer(around(U, s**2), lnJp[None], around(U, tau), excess)
 
 
-ORACLES = {"elastic": elastic, "sand": sand, "snow": snow}
+def hencky(F: np.ndarray, material: Material) -> tuple[dict[str, float], np.ndarray, np.ndarray, np.ndarray, float]:
+    """Parameters with lam, mu and K, axes (n, 3, 3), mean log strain (n, 1), stress deviator (n, 3) and K."""
+    given = numbers(material)
+    U, S, _ = np.linalg.svd(F)
+    given["lam"], given["mu"] = lame(given["E"], given["nu"])
+    eps = np.log(S)
+    mean = eps.mean(axis=1, keepdims=True)
+    return given, U, mean, 2 * given["mu"] * (eps - mean), given["lam"] + 2 * given["mu"] / 3
+
+
+def answered(U: np.ndarray, given: dict, history: np.ndarray, p: np.ndarray, s: np.ndarray, excess: Any) -> Answer:
+    """The answer of Hencky elasticity with pressure p (n, 1) and stress deviator s (n, 3), both in Pa."""
+    K = given["lam"] + 2 * given["mu"] / 3
+    eps = s / (2 * given["mu"]) - p / (3 * K)
+    return Answer(around(U, np.exp(2 * eps)), history, around(U, s - p), np.asarray(excess) / given["E"])
+
+
+def von_mises(F: np.ndarray, history: np.ndarray, material: Material) -> Answer:
+    """Simo & Hughes box 3.1 in terms of the uniaxial stress q."""
+    g, U, mean, s, K = hencky(F, material)
+    q = np.sqrt(1.5) * np.linalg.norm(s, axis=1)
+    strain = np.maximum(q - g["yield_stress"] - g["hardening"] * history[0], 0) / (3 * g["mu"] + g["hardening"])
+    kept = 1 - 3 * g["mu"] * strain / q
+    excess = kept * q - g["yield_stress"] - g["hardening"] * (history[0] + strain)
+    return answered(U, g, (history[0] + strain)[None], -3 * K * mean, s * kept[:, None], excess)
+
+
+def herschel_bulkley(F: np.ndarray, history: np.ndarray, material: Material) -> Answer:
+    """Without hurry: what is above the yield stress is gone."""
+    g, U, mean, s, K = hencky(F, material)
+    shear = np.linalg.norm(s, axis=1) / np.sqrt(2)
+    kept = np.minimum(g["yield_stress"] / shear, 1)
+    return answered(U, g, history, -3 * K * mean, s * kept[:, None], kept * shear - g["yield_stress"])
+
+
+def mu_i(F: np.ndarray, history: np.ndarray, material: Material) -> Answer:
+    """Without hurry: a cone with the friction at rest, which touches nobody in tension."""
+    g, U, mean, s, K = hencky(F, material)
+    vc = history[0][:, None]
+    p = -K * (3 * mean + vc)
+    shear = np.linalg.norm(s, axis=1, keepdims=True) / np.sqrt(2)
+    pressed = p > 0
+    kept = np.where(pressed, np.minimum(g["mu_s"] * p / np.maximum(shear, 1e-300), 1), 0)
+    gained = np.where(pressed, 0, vc + 3 * mean)[:, 0]  # what pressed grains had to close is in their strain
+    p = np.where(pressed, p, 0)
+    excess = (kept * shear - g["mu_s"] * p)[:, 0]
+    return answered(U, g, np.clip(gained, -DILATION_CAP, DILATION_CAP)[None], p, s * kept, excess)
+
+
+def cam_clay(F: np.ndarray, history: np.ndarray, material: Material) -> Answer:
+    """G18, grain by grain: the tips, and where the line from the trial to the ellipse's middle enters by bisection."""
+    g, U, mean, s, K = hencky(F, material)
+    beta, M = g["beta"], g["M"]
+    p0 = K * np.sinh(g["xi"] * np.maximum(g["compaction"] - history[0], 0))
+
+    def outside(q: Any, p: Any, p0: Any) -> Any:
+        return (1 + 2 * beta) * q**2 + M**2 * (p + beta * p0) * (p - p0)
+
+    p_new, kept, flow, excess = (np.zeros(len(F)) for _ in range(4))
+    for i, (p, q, top) in enumerate(
+        zip(-3 * K * mean[:, 0], np.sqrt(1.5) * np.linalg.norm(s, axis=1), p0, strict=True)
+    ):
+        p_new[i], kept[i] = p, 1
+        if p > top or p < -beta * top:
+            p_new[i] = top if p > top else -beta * top
+            kept[i], flow[i] = 0, (p_new[i] - p) / K
+        elif outside(q, p, top) > 0:
+            kept[i] = M * np.sqrt(-(p + beta * top) * (p - top) / (1 + 2 * beta)) / q
+            middle, low, high = (1 - beta) / 2 * top, 0.0, 1.0
+            for _ in range(60):
+                t = (low + high) / 2
+                low, high = (t, high) if outside(t * q, middle + t * (p - middle), top) < 0 else (low, t)
+            flow[i] = (middle + low * (p - middle) - p) / K
+        excess[i] = np.sqrt(max(outside(kept[i] * q, p_new[i], top), 0)) - 1e-7 * top  # a root of round-off
+    return answered(U, g, (history[0] + flow)[None], p_new[:, None], s * kept[:, None], excess)
+
+
+ORACLES = {
+    "elastic": elastic,
+    "sand": sand,
+    "snow": snow,
+    "von_mises": von_mises,
+    "herschel_bulkley": herschel_bulkley,
+    "mu_i": mu_i,
+    "cam_clay": cam_clay,
+}
 
 
 def rows(t: np.ndarray, d: int) -> np.ndarray:

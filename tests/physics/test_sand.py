@@ -139,7 +139,9 @@ def driven(material: Material, step: Array, steps: Array, held: Array) -> Array:
     soft = jnp.sum(held) * K + material.E  # stiffer than any of them: the sides reach their stress from one side
 
     def answer(eps: Array) -> tuple[Array, Array]:
-        e, _, tau = material.update(jnp.concatenate([jnp.expm1(2 * eps), jnp.zeros_like(eps)]), jnp.zeros_like(eps[:1]))
+        e, _, tau = material.update(
+            jnp.concatenate([jnp.expm1(2 * eps), jnp.zeros_like(eps)]), jnp.zeros_like(eps[:1]), 0.0
+        )
         return 0.5 * jnp.log1p(e[:3]), tau[:3]
 
     def give_way(_: Array, trial: Array) -> Array:

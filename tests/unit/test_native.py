@@ -111,8 +111,8 @@ def test_trajectories_are_those_of_the_reference(d: int, law: str, dtype: str) -
 class Softer(Elastic):
     """A material that the kernels do not know."""
 
-    def update(self, e: Array, history: Array) -> tuple[Array, Array, Array]:
-        e, history, tau = super().update(e, history)
+    def update(self, e: Array, history: Array, dt: float | Array) -> tuple[Array, Array, Array]:
+        e, history, tau = super().update(e, history, dt)
         return e, history, 0.5 * tau
 
 
@@ -177,8 +177,8 @@ def errors(law: str, d: int, values: Callable[[np.random.Generator, int], np.nda
     got = move(grid(d), Bed(material(law, "float32"), 0, p.count), p, jnp.zeros((*grid(d).shape, 4)), TIME, "native")
     with jax.enable_x64(True):
         wide = jnp.asarray(np.asarray(e), "float64")
-        truth = material(law, "float64").update(wide, jnp.zeros((1, p.count), "float64"))
-    plain, found = material(law, "float32").update(e, jnp.zeros((1, p.count), "float32")), {}
+        truth = material(law, "float64").update(wide, jnp.zeros((1, p.count), "float64"), TIME)
+    plain, found = material(law, "float32").update(e, jnp.zeros((1, p.count), "float32"), TIME), {}
     for name, *rows in zip(("e", "history", "tau"), (got.e, got.history, got.tau), plain, truth, strict=True):
         mine, usual, true = (np.asarray(a, float) for a in rows)
         assert np.isfinite(mine).all()

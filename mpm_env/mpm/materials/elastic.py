@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from mpm_env.mpm.linalg3 import compose, eigen
-from mpm_env.mpm.materials.protocol import LEAST_B, hencky_energy, lame, p_wave_speed
+from mpm_env.mpm.linalg3 import compose
+from mpm_env.mpm.materials.protocol import hencky_energy, hencky_strain, lame, p_wave_speed
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=["E", "nu", "rho"], meta_fields=[])
@@ -27,17 +27,15 @@ class Elastic:
     rho: Array
     history_start: ClassVar[tuple[float, ...]] = ()
 
-    def update(self, e: Array, history: Array) -> tuple[Array, Array, Array]:
+    def update(self, e: Array, history: Array, dt: float | Array) -> tuple[Array, Array, Array]:
         """Stress of the strain e; the strain itself is kept."""
-        values, axes = eigen(e)
-        eps = 0.5 * jnp.log1p(jnp.maximum(values, LEAST_B - 1))
+        eps, axes = hencky_strain(e)
         lam, mu = lame(self.E, self.nu)
         return e, history, compose(axes, 2 * mu * eps + lam * jnp.sum(eps, axis=0))
 
     def energy(self, e: Array, history: Array) -> Array:
         """Elastic energy density, (n,) J/m^3."""
-        eps = 0.5 * jnp.log1p(jnp.maximum(eigen(e)[0], LEAST_B - 1))
-        return hencky_energy(eps, *lame(self.E, self.nu))
+        return hencky_energy(e, *lame(self.E, self.nu))
 
     def wave_speed(self) -> Array:
         """Compression wave speed at rest, m/s."""

@@ -47,7 +47,7 @@ class Snow:
         Jp = jnp.maximum(jnp.exp(history[0]), self.Jp_min)
         return jnp.exp(self.xi * (1 - Jp))
 
-    def update(self, e: Array, history: Array) -> tuple[Array, Array, Array]:
+    def update(self, e: Array, history: Array, dt: float | Array) -> tuple[Array, Array, Array]:
         """Clamp the principal stretches, move the rest into ln J_P, answer with the hardened stress (S13 section 5)."""
         values, axes = eigen(e)
         values = jnp.maximum(values, LEAST_B - 1)
