@@ -32,6 +32,7 @@ FLOORS = {
     "mpm_env.tasks": 3,
     "mpm_env.cli": 4,
     "mpm_env.demo": 4,
+    "mpm_env.element": 4,
     "mpm_env.env": 4,
     "mpm_env.ledger": 4,
     "mpm_env.log": 4,
