@@ -1,4 +1,4 @@
-"""The command line: mpm-env run, demo, replay, list."""
+"""The command line: mpm-env run, demo, replay, element, calibrate, list."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ first steps:
   mpm-env run column_collapse_2d --fidelity draft --out out
   mpm-env run blade_push --set bodies.friction=0.2 --set fidelity.cells=5 --out out
   mpm-env replay out/run.rrd --view
+  mpm-env element dry_sand --test triaxial --out out
 
 exit status: 0 done, 1 a replay differs, a run broke down or a demo missed its goal, 2 refused, 130 interrupted
 """
@@ -223,7 +224,50 @@ def _demo(options: argparse.Namespace) -> int:
     return 0 if summary["success"] else DIFFERS
 
 
-COMMANDS = (_add_run, _add_demo, _add_replay, _add_list)
+def _add_element(commands: Any) -> None:
+    element = commands.add_parser("element", help="a laboratory's test on a material, one grain", allow_abbrev=False)
+    _add_material(element)
+    element.add_argument("--test", required=True, metavar="T", help="triaxial, biaxial, oedometer or shear")
+    _add_loading(element)
+    element.add_argument("--out", metavar="DIR", help="folder for element.csv and element.png (default: none written)")
+    element.set_defaults(command=_element)
+
+
+def _add_material(command: Any) -> None:
+    command.add_argument("material", metavar="MATERIAL", help="a name that `mpm-env list` shows, or a .yaml file")
+    command.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        dest="settings",
+        help="as friction_deg=30",
+    )
+
+
+def _add_loading(command: Any) -> None:
+    command.add_argument("--pressure", type=float, default=1e4, metavar="PA", help="held stress (default 10 kPa)")
+    command.add_argument("--strain", type=float, metavar="E", help="how far, negative: extension (default: the test's)")
+    command.add_argument("--rate", type=float, default=1.0, metavar="1/S", help="for materials that mind (default 1)")
+    command.add_argument("--steps", type=int, default=1000, metavar="N", help="of the loading (default 1000)")
+    command.add_argument("--dimension", type=int, metavar="D", help="2 is plane strain (default: the test's)")
+
+
+def _element(options: argparse.Namespace) -> int:
+    with refusing():
+        from mpm_env import laboratory
+
+        loading = laboratory.loading(**{k: getattr(options, k) for k in laboratory.Loading._fields})
+        done = laboratory.put_through(options.material, tuple(options.settings), loading, options.out)
+    print(f"{options.material}: {loading.test} test, {done.about}")
+    for name, value in done.figures.items():
+        print(f"  {name:45} {value:.5g}")
+    if options.out:
+        print(f"{options.out}: {', '.join(laboratory.FILES)}")
+    return 0
+
+
+COMMANDS = (_add_run, _add_demo, _add_replay, _add_element, _add_list)
 
 
 @contextlib.contextmanager

@@ -149,6 +149,20 @@ MaterialConfig = Annotated[
 ]
 
 
+class MaterialFile(Section):
+    """A material on its own."""
+
+    material: MaterialConfig
+
+
+def read_material(name: str, settings: tuple[str, ...] = ()) -> MaterialConfig:
+    """A shipped material by name, or one from a .yaml file, with settings like "friction_deg=30" on top."""
+    path = find("materials", name)
+    data = read_yaml(path)
+    overlay(data, settings)
+    return parse(MaterialFile, {"material": data}, path.name).material
+
+
 class ReliefConfig(Section):
     """A seeded uneven top."""
 

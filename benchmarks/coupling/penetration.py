@@ -20,7 +20,7 @@ from benchmarks.clock import significant
 from benchmarks.coupling import cutting, impact, intrusion
 from benchmarks.coupling.fits import line
 from benchmarks.coupling.intrusion import ALONG_FLAT, ALONG_UPRIGHT, DOWN, UP, UP_DEEPER
-from benchmarks.coupling.picture import Series, plot
+from mpm_env.plot import Series, plot
 
 PLOTS = machine.ROOT / "docs" / "coupling"
 Band = tuple[float, float]  # the values that agree with a reference

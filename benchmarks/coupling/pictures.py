@@ -22,7 +22,7 @@ from benchmarks import machine, results
 from benchmarks.coupling import blade, tell_apart
 from benchmarks.coupling.beds import lighter, started
 from benchmarks.coupling.drop import DX, RATIOS, drop, settled_below
-from benchmarks.coupling.picture import INK, Series, plot
+from mpm_env.plot import INK, Series, plot
 from benchmarks.coupling.report import brief
 from benchmarks.coupling.scenes import Steps, ride, run
 from benchmarks.coupling.slices import LARGE, Panel, Window, draw, letters

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from benchmarks.coupling.picture import INK
+from mpm_env.plot import INK
 from mpm_env.log import RAMP_RGB
 from mpm_env.view import View
 
