@@ -27,7 +27,8 @@ def test_element_prints_its_figures_and_leaves_the_path(tmp_path: Path, capsys: 
     table = np.array(rows, float)
     np.testing.assert_allclose(table[:, head.index("syy_Pa")], 1e4, rtol=1e-6)
     assert table[-1, head.index("mobilised_deg")] == pytest.approx(35, abs=0.01)
-    assert Image.open(out / "element.png").size == (640, 440)
+    with Image.open(out / "element.png") as picture:
+        assert picture.size == (640, 440)
 
 
 REFUSED = {
