@@ -267,7 +267,44 @@ def _element(options: argparse.Namespace) -> int:
     return 0
 
 
-COMMANDS = (_add_run, _add_demo, _add_replay, _add_element, _add_list)
+def _add_calibrate(commands: Any) -> None:
+    calibrate = commands.add_parser(
+        "calibrate", help="a material's parameters from a measured curve", allow_abbrev=False
+    )
+    _add_material(calibrate)
+    calibrate.add_argument("--curve", required=True, metavar="FILE.csv", help="columns strain and q_Pa, or sxx_Pa, ...")
+    calibrate.add_argument("--test", required=True, metavar="T", help="that measured it: triaxial, biaxial, ...")
+    calibrate.add_argument("--free", required=True, metavar="NAMES", help="what to find, as friction_deg,E")
+    _add_loading(calibrate)
+    calibrate.add_argument("--out", metavar="DIR", help="folder for fitted.yaml and fit.png (default: none written)")
+    calibrate.set_defaults(command=_calibrate)
+
+
+def _calibrate(options: argparse.Namespace) -> int:
+    with refusing():
+        from mpm_env import calibrate, laboratory
+
+        found = calibrate.go(
+            options.material,
+            tuple(options.settings),
+            tuple(name.strip() for name in options.free.split(",")),
+            options.curve,
+            laboratory.Loading(**{k: getattr(options, k) for k in laboratory.Loading._fields}),
+            options.out,
+        )
+    for name, value, error in zip(found.names, found.values, found.errors, strict=True):
+        print(f"{name:15} {value:.6g} +- {error:.2g}" if error < float("inf") else f"{name:15} not told by this curve")
+    for names in found.untold:
+        print(
+            f"warning: this curve cannot tell {' from '.join(names)}{'' if len(names) > 1 else ': it does not change'}"
+        )
+    print(f"misfit {100 * found.misfit:.3g} % of {len(found.strain)} points")
+    if options.out:
+        print(f"{options.out}: {', '.join(calibrate.FILES)}")
+    return 0
+
+
+COMMANDS = (_add_run, _add_demo, _add_replay, _add_element, _add_calibrate, _add_list)
 
 
 @contextlib.contextmanager

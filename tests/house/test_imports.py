@@ -30,6 +30,7 @@ FLOORS = {
     "mpm_env.sim": 2,
     "mpm_env.wrench": 2,
     "mpm_env.tasks": 3,
+    "mpm_env.calibrate": 4,
     "mpm_env.cli": 4,
     "mpm_env.demo": 4,
     "mpm_env.element": 4,
