@@ -268,19 +268,36 @@ def _element(options: argparse.Namespace) -> int:
 
 
 def _add_calibrate(commands: Any) -> None:
-    calibrate = commands.add_parser(
-        "calibrate", help="a material's parameters from a measured curve", allow_abbrev=False
-    )
+    calibrate = commands.add_parser("calibrate", help="parameters from measurements", allow_abbrev=False)
     _add_material(calibrate)
-    calibrate.add_argument("--curve", required=True, metavar="FILE.csv", help="columns strain and q_Pa, or sxx_Pa, ...")
-    calibrate.add_argument("--test", required=True, metavar="T", help="that measured it: triaxial, biaxial, ...")
-    calibrate.add_argument("--free", required=True, metavar="NAMES", help="what to find, as friction_deg,E")
+    what = calibrate.add_mutually_exclusive_group(required=True)
+    what.add_argument("--curve", metavar="FILE.csv", help="columns strain and q_Pa, or sxx_Pa, sxy_Pa, ...")
+    what.add_argument(
+        "--column", nargs=3, type=float, metavar=("WIDTH", "HEIGHT", "RUNOUT"), help="m; of sand, in plane strain"
+    )
+    calibrate.add_argument("--test", default="triaxial", metavar="T", help="that measured the curve (default triaxial)")
+    calibrate.add_argument("--free", default="friction_deg", metavar="NAMES", help="to find (default friction_deg)")
     _add_loading(calibrate)
-    calibrate.add_argument("--out", metavar="DIR", help="folder for fitted.yaml and fit.png (default: none written)")
+    calibrate.add_argument("--out", metavar="DIR", help="folder for fitted.yaml and fit.png of a curve")
     calibrate.set_defaults(command=_calibrate)
 
 
 def _calibrate(options: argparse.Namespace) -> int:
+    return _calibrate_column(options) if options.column else _calibrate_curve(options)
+
+
+def _calibrate_column(options: argparse.Namespace) -> int:
+    with refusing():
+        from mpm_env.calibrate_column import Column, fit_column
+        from mpm_env.scene_config import read_material
+
+        found = fit_column(read_material(options.material, tuple(options.settings)), Column(*options.column))
+    print(f"friction_deg    {found.friction_deg:.4g} +- {found.scatter_deg:.2g} (seeds of the grains)")
+    print(f"finer cells would change it by {found.resolution_deg:+.2g}; {found.runs} runs")
+    return 0
+
+
+def _calibrate_curve(options: argparse.Namespace) -> int:
     with refusing():
         from mpm_env import calibrate, laboratory
 
@@ -295,9 +312,8 @@ def _calibrate(options: argparse.Namespace) -> int:
     for name, value, error in zip(found.names, found.values, found.errors, strict=True):
         print(f"{name:15} {value:.6g} +- {error:.2g}" if error < float("inf") else f"{name:15} not told by this curve")
     for names in found.untold:
-        print(
-            f"warning: this curve cannot tell {' from '.join(names)}{'' if len(names) > 1 else ': it does not change'}"
-        )
+        alone = "" if len(names) > 1 else ": it changes nothing here"
+        print(f"warning: this curve cannot tell {' from '.join(names)}{alone}")
     print(f"misfit {100 * found.misfit:.3g} % of {len(found.strain)} points")
     if options.out:
         print(f"{options.out}: {', '.join(calibrate.FILES)}")
