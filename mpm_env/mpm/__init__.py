@@ -27,5 +27,8 @@ Sources: [S13] Stomakhin et al., A material point method for snow simulation, SI
 affine particle-in-cell method, SIGGRAPH 2015. [J16] Jiang et al., The material point method for simulating continuum
 materials, SIGGRAPH 2016 course. [K16] Klar et al., Drucker-Prager elastoplasticity for sand animation, SIGGRAPH 2016.
 [T17] Tampubolon et al., Multi-species simulation of porous sand and water, SIGGRAPH 2017. [H18] Hu et al., A moving
-least squares material point method, SIGGRAPH 2018.
+least squares material point method, SIGGRAPH 2018. [JK] Jop, Forterre & Pouliquen, A constitutive law for dense
+granular flows, Nature 441, 2006. [D15] Dunatunga & Kamrin, Continuum modelling and simulation of granular flows
+through their many phases, J. Fluid Mech. 779, 2015. [Y15] Yue et al., Continuum foam, ACM Trans. Graph. 34, 2015.
+[G18] Gaume et al., Dynamic anticrack propagation in snow, Nature Communications 9, 2018.
 """

@@ -37,6 +37,7 @@ REFUSED = {
     ("dry_sand", "--test", "shear", "--pressure", "-3"): "pressure should be positive and finite, got -3.0 Pa.",
     ("dry_sand", "--test", "triaxial", "--dimension", "2"): "it needs dimension 3",
     ("dry_sand", "--test", "shear", "--set", "friction_deg=95"): "friction_deg should be less than 90, got 95",
+    ("glass_beads", "--test", "shear", "--set", "mu_2=0.3"): "needs mu_s < mu_2, got 0.3819 and 0.3",
     ("dry_sand", "--test", "triaxial", "--set", "friction_fit=mc2d"): "'mc2d' knows plane strain only",
 }
 
