@@ -9,6 +9,8 @@ from datetime import date
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+# What a result depends on.
+MEASURED = ("mpm_env", "coupling", "configs", "benchmarks", ":!benchmarks/results")
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("mpm-env", "jax", "jaxlib", "numpy", "mujoco", "mujoco-mjx")
 
@@ -34,7 +36,7 @@ def commit() -> str:
     def git(*words: str) -> str:
         return subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=False).stdout.strip()
 
-    changed = git("status", "--porcelain", "--untracked-files=no", "--", "mpm_env", "coupling", "configs")
+    changed = git("status", "--porcelain", "--untracked-files=no", "--", *MEASURED)
     return (git("rev-parse", "--short", "HEAD") or "unknown") + (" with changes" if changed else "")
 
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 SIZE = (6.4, 4.4)  # inches, at 100 dots each
 INK = "#222222"  # of all that is written
-CORNERS = {"above": "upper left", "middle": "center right", "below": "lower right"}
+_CORNERS: Any = {"above": "upper left", "middle": "center right", "below": "lower right"}
 
 
 class Series(NamedTuple):
@@ -24,7 +24,14 @@ class Series(NamedTuple):
 
 
 def plot(
-    path: Path, title: str, x: str, y: str, series: Sequence[Series], *, log: bool = False, names: str = "above"
+    path: Path,
+    title: str,
+    x: str,
+    y: str,
+    series: Sequence[Series],
+    *,
+    log: bool = False,
+    names: Literal["above", "middle", "below"] = "above",
 ) -> None:
     """Write a plot; axes named x and y, both logarithmic where asked for.
 
@@ -43,5 +50,5 @@ def plot(
         axes.set_yscale("log")
     axes.grid(color="#dddddd")
     if any(s.name for s in series):
-        axes.legend(loc=CORNERS[names], fontsize="small", framealpha=0.8)
+        axes.legend(loc=_CORNERS[names], fontsize="small", framealpha=0.8)
     figure.savefig(path)

@@ -25,7 +25,7 @@ from mpm_env import Drive, Scene, State, advance, scripted, sim
 
 BATCH = 64
 AT = 1.0  # s: the bucket is in the bed
-STEPS = 5  # rigid steps of a call
+STEPS = 25  # rigid steps of a call
 
 
 def with_bodies(scene: Scene, drives: Drive, state: State) -> State:

@@ -35,15 +35,15 @@ REST_RATIOS = (0.1, 1.0)
 SPACE_RATIOS = (0.1, 1.0, 10.0)  # in 3-D
 
 STORED = (
-    "Sand without damping gives back what it stored, so boxes bounce and ring on it: that is the bed, for the contact"
-    " only dissipates, as the energy shows. Stiffer sand stores less"
+    "Sand without damping gives back what it stored, so boxes bounce and ring on it; the contact only dissipates, as"
+    " the energy shows. Stiffer sand stores less, which helps boxes as dense as sand; heavier ones it hardly helps"
 )
 HEAVY = "The mean over a quarter of a second of a box that still moves"
 DEEP = "It sinks by cells, and still moves at the end; how much of the scatter is that is not known"
 BANDS = (
     Band("rise", 0.0, 0.01),
-    Band("rebound", 0.0, 0.1, STORED),
-    Band("rms_m_s", 0.0, 0.01, STORED),
+    Band("rebound", 0.0, 0.05, STORED),
+    Band("rms_m_s", 0.0, 0.002, STORED),
     Band("weight", 0.99, 1.01, HEAVY),
     Band("inside_cells", 0.0, 0.25),
     *(Band("rests_cells", -0.5, 0.5, where={"ratio": ratio}) for ratio in RATIOS if ratio <= 1),

@@ -22,12 +22,12 @@ from benchmarks import machine, results
 from benchmarks.coupling import blade, tell_apart
 from benchmarks.coupling.beds import lighter, started
 from benchmarks.coupling.drop import DX, RATIOS, drop, settled_below
-from mpm_env.plot import INK, Series, plot
 from benchmarks.coupling.report import brief
 from benchmarks.coupling.scenes import Steps, ride, run
 from benchmarks.coupling.slices import LARGE, Panel, Window, draw, letters
 from mpm_env import Scene, State, build, load_fidelity, read_scene
 from mpm_env.log import Recorder
+from mpm_env.plot import INK, Series, plot
 from mpm_env.render import Camera
 from mpm_env.run import recipe
 from mpm_env.view import View, camera_of, no_reactions, write_frame

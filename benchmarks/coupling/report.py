@@ -71,9 +71,11 @@ def bounds(result: Row) -> str:
     texts = []
     for (measure, low, high), bands in alike.items():
         ratios = ", ".join(f"{band.where['ratio']:g}" for band in bands if "ratio" in band.where)
+        thick = ", ".join(f"{band.where['thick_cells']:g}" for band in bands if "thick_cells" in band.where)
         told = " (told to move)" if bands[0].where.get("told") else ""
         limits = f"at most {high:g}" if low == 0 else f"{low:g} to {high:g}"
-        texts.append(f"{MEASURES[measure]}: {limits}{f' (density ratio {ratios})' if ratios else told}")
+        where = f" (density ratio {ratios})" if ratios else f" ({thick} cells thick)" if thick else told
+        texts.append(f"{MEASURES[measure]}: {limits}{where}")
     return f"Asked for: {'; '.join(texts)}.\n\n"
 
 
@@ -160,18 +162,18 @@ def blade(r: Row) -> str:
     """A blade through a bed."""
     fine, flat, deep = ([row for row in r["rows"] if row["name"] == name] for name in ("reference", "slice", "3-D"))
     fine += [row for row in r["rows"] if row["name"] == "finer"]
-    (band,) = (b for b in bands_of(r) if b.measure == "over_reference")
+    bands = [b for b in bands_of(r) if b.measure == "over_reference"]
     stretches = list(fine[0]["force_N_m"])
     rows = []
     for x in fine:
         name = f"{x['name']}: cells of {1000 * x['cell_m']:.3g} mm, {1000 * x['thick_m']:g} mm thick"
         forces = [f"{x['force_N_m'][s]:.0f}" for s in stretches]
         rows.append([name, *forces, "", seen(r, [x], "leaked"), troubled([x])])
-    for thick in dict.fromkeys(x["thick_cells"] for x in flat):
-        some = [x for x in flat if x["thick_cells"] == thick]
-        cells = [_force(some, s, band) for s in stretches]
+    for name in dict.fromkeys(map(_thick, flat)):
+        some = [x for x in flat if _thick(x) == name]
+        cells = [_force(some, s, bands) for s in stretches]
         over = span((x["over_reference"][s] for x in some for s in stretches), lambda v: f"{v:.2f}")
-        rows.append([_thick(some[0]), *cells, over, seen(r, some, "leaked"), troubled(some)])
+        rows.append([name, *cells, over, seen(r, some, "leaked"), troubled(some)])
     offsets = ", ".join(f"{o:g}" for o in dict.fromkeys(x["offset"] for x in flat))
     text = (
         "10 cm deep, 0.3 m/s. The force in N per metre of width, averaged over stretches of the way, with its spread"
@@ -195,15 +197,16 @@ def blade(r: Row) -> str:
 
 
 def _thick(row: Row) -> str:
-    return f"{row['thick_cells']:g} cell{'s' * (row['thick_cells'] != 1)} thick"
+    alone = "" if row.get("push_out", True) else ", by the grid alone"
+    return f"{row['thick_cells']:g} cell{'s' * (row['thick_cells'] != 1)} thick{alone}"
 
 
-def _force(rows: Sequence[Row], stretch: str, band: Band) -> str:
-    """Mean and standard deviation of the force over a stretch, marked where one run lies outside the band."""
+def _force(rows: Sequence[Row], stretch: str, bands: Sequence[Band]) -> str:
+    """Mean and standard deviation of the force over a stretch, marked where one run lies outside its band."""
     forces = [row["force_N_m"][stretch] for row in rows]
     mean = sum(forces) / len(forces)
     spread = (sum((f - mean) ** 2 for f in forces) / len(forces)) ** 0.5
-    return marked(f"{mean:.0f} ± {spread:.0f}", any(band.misses(row, stretch) for row in rows))
+    return marked(f"{mean:.0f} ± {spread:.0f}", any(band.misses(row, stretch) for band in bands for row in rows))
 
 
 def penetration(r: Row) -> str:

@@ -10,8 +10,8 @@ import mujoco
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from mpm_env.plot import INK
 from mpm_env.log import RAMP_RGB
+from mpm_env.plot import INK
 from mpm_env.view import View
 
 SHARP = 3  # grains are drawn so many times larger, and then made small

@@ -27,7 +27,7 @@ where the grains last saw the bodies.
   cells. `push_out: true`, the default, also stops every grain that entered a body and puts it back to the surface.
 - **One way.** `two_way: false` moves bodies as if there were no grains and solves nothing; wrenches are still told.
 - **Reports.** `State.contact` tells each rigid step's deepest grain, peak force, momentum that did not close, share of
-  the equation left, and how far MJX's end was from the one that grains saw; each has a health bit.
+  the equation left, and how far MJX's end was from the one that grains saw; all but the force have a health bit.
 
 """
 
@@ -51,7 +51,8 @@ surface to the box's underside. The energy is that of sand and box together.
 
 PENETRATION = """\
 Walls against Rankine's passive pressure, blades against the fundamental earth-moving equation, plates against
-resistive forces, dropped balls and cones against the laws of impact.
+resistive forces, dropped balls and cones against the laws of impact. Each in the sand of its experiment: of 2 MPa for
+walls and blades, 30 degrees for plates, 24 degrees for balls.
 
 """
 
@@ -60,7 +61,9 @@ LIMITS = """## Limits
 With the default band, a surface loses part of its adhesion where its face lies three quarters of a cell beyond a
 plane of nodes: scenes with adhesion want `contact_band: 0.5`, which loses less (`tests/coupling/test_adhesion.py`).
 A foam box may leave a substep of its impact unsolved, which a health bit tells. Contact of a block in a notch comes
-and goes, and a block of sand there creeps. Rigid contacts are as hard as their solimp.
+and goes, and a block of sand there creeps. Rigid contacts are as hard as their solimp. The thickness of a mesh is
+that of its thickest part: a thin wall on a thick mesh is not refused. Where grains of two densities meet a body, gaps
+are told as for the lighter ones, so the heavier touch early.
 """
 
 SCENES = {

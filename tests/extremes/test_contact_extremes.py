@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 import yaml
 
-from benchmarks.coupling.beds import G, at_rest, planted, without
-from benchmarks.coupling.scenes import SAND, Bed
+from benchmarks.coupling.beds import SAND, G, at_rest, without
+from benchmarks.coupling.scenes import Bed, planted
 from benchmarks.coupling.tell_apart import squeezed
 from mpm_env import Drive, State, build, read_scene
 from mpm_env.health import Health

@@ -10,7 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.coupling.beds import ROWS, G
+from benchmarks.coupling.beds import G
+from benchmarks.coupling.scenes import ROWS
 from coupling.bodies import refresh
 from mpm_env import Scene, State, scripted
 from mpm_env.health import MOST_TRAVEL, Health, names
