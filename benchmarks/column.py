@@ -35,14 +35,15 @@ NOT_HERE = 3  # exit status for a variant that this version or machine does not 
 
 
 def column(
-    n: int, *, material: str = "sand", dimension: int = 3, precision: str = "f32", kernels: str = "auto"
+    n: int, *, material: str = "sand", dimension: int = 3, precision: str = "f32", kernels: str = "auto", room: int = 1
 ) -> Scene:
-    """The column as a scene. Raises ValueError for a variant that cannot be had."""
+    """The column as a scene, in a box with sides `room` times as long. Raises ValueError for what cannot be had."""
+    reach, height = room * job.WIDTH / 2, room * job.HEIGHT
     half, dt = job.SIDE / 2, job.DT_PER_CELL * job.SIDE / n
     fill = {"shape": "box", "lower": [-half, -half, 0.0], "upper": [half, half, job.SIDE]}
     data = {
         "name": "column",
-        "box": {"lower": [-job.WIDTH / 2] * 2 + [0.0], "upper": [job.WIDTH / 2] * 2 + [job.HEIGHT]},
+        "box": {"lower": [-reach, -reach, 0.0], "upper": [reach, reach, height]},
         "feature": job.SIDE,
         "gravity": [0.0, 0.0, -job.GRAVITY],
         "duration": 1.0,
@@ -90,7 +91,8 @@ def program(scene: Scene, envs: int = 1, batching: str = "map") -> tuple[Callabl
 
 def run(a: argparse.Namespace) -> None:
     """Measure the variant asked for. Raises ValueError where it cannot be had."""
-    scene = column(a.n, material=a.material, dimension=a.dimension, precision=a.precision, kernels=a.kernels)
+    kind = {key: getattr(a, key) for key in ("material", "dimension", "precision", "kernels", "room")}
+    scene = column(a.n, **kind)
     step, start = program(scene, a.envs, a.batching)
     now = start
 
@@ -117,6 +119,8 @@ def run(a: argparse.Namespace) -> None:
         "material": a.material,
         "dimension": a.dimension,
         "precision": a.precision,
+        "room": a.room,
+        "nodes": scene.grid.nodes,
         "envs": a.envs,
         "batching": a.batching,
         "cores": a.cores,
@@ -132,6 +136,7 @@ def main() -> None:
     parser.add_argument("--material", default="sand", choices=tuple(MATERIALS))
     parser.add_argument("--dimension", type=int, default=3, choices=(2, 3))
     parser.add_argument("--precision", default="f32", choices=("f32", "f64"))
+    parser.add_argument("--room", type=int, default=1, help="times as long as usual: the sides of the box around it")
     parser.add_argument("--envs", type=int, default=1, help="columns in one compiled program")
     parser.add_argument("--batching", default="map", choices=("map", "vmap"))
     parser.add_argument("--cores", type=int, default=1)

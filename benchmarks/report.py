@@ -35,6 +35,8 @@ def throughput(r: dict[str, Any]) -> str:
         key, unit = ("Mpss", "M/s of wall time") if sweep == "cores" else ("Mpss_cpu", "M/s")
         body = [[n, *(brief(by_kernels[k].get(n, {}).get(key)) for k in kinds)] for n in names]
         text += table([sweep, *(f"{k}, {unit}" for k in kinds)], body) + "\n"
+        if sweep == "room":
+            text += room(by_kernels)
     rows = [
         [k, f["ns_per_grain"], f["fixed_us"], f["exponent"], f["bytes_per_grain"], f["base_mb"]]
         for k, f in r["fit"].items()
@@ -55,6 +57,17 @@ def throughput(r: dict[str, Any]) -> str:
         + text
         + f"\nLargest difference of r99, z99 and zcom at t = 0.1 s from the C++ code's: {same}.\n"
     )
+
+
+def room(by_kernels: dict[str, Any]) -> str:
+    """What an empty box costs."""
+    text = "The same grains in a larger box: plain XLA works on all nodes, the native kernels on those near grains.\n\n"
+    for kernels, rows in by_kernels.items():
+        if len(rows) > 1:
+            first, *_, last = rows.values()
+            cost, more = first["Mpss_cpu"]["median"] / last["Mpss_cpu"]["median"], last["nodes"] / first["nodes"]
+            text += f"- {kernels}: with {more:.2g} times as many nodes {cost:.2g} times the cost\n"
+    return text + "\n"
 
 
 def compare(r: dict[str, Any]) -> str:

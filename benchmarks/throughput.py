@@ -1,4 +1,4 @@
-"""How fast the column runs, over size, dimension, material, precision, kernels, batch and cores.
+"""How fast the column runs, over size, dimension, material, precision, kernels, room, batch and cores.
 
     python -m benchmarks.throughput [--quick] [--only SWEEP ...]
 
@@ -52,6 +52,7 @@ def sweeps(quick: bool) -> dict[str, dict[str, list[str]]]:
         "material": {"sand": one, **{m: variant(middle, material=m) for m in ("snow", "elastic")}},
         "precision": {"f32": one, "f64": variant(middle, precision="f64")},
     }
+    found["room"] = {f"box {k} x as long a side": variant(10, **({"room": k} if k > 1 else {})) for k in (1, 2, 4)}
     if quick:
         found["batch"] = {f"{b} x 1728": variant(6, envs=b) if b > 1 else variant(6) for b in (1, 16)}
     else:

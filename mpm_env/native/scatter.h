@@ -17,6 +17,7 @@ struct Plan {  // of one environment
   std::vector<int32_t> first, last;        // per block: lowest and highest first plane of its windows
   std::vector<Reach> reach;                // per column
   std::vector<int64_t> at_plane;           // grains whose window starts at each plane
+  int64_t low_row, high_row;               // lowest and highest first row of windows, the columns of a plane
 };
 
 template <class S, int D> void survey(const ToNodes& t, const S* x, const S* m, Plan& plan) {
@@ -28,6 +29,8 @@ template <class S, int D> void survey(const ToNodes& t, const S* x, const S* m, 
   plan.last.assign(plan.first.size(), -1);
   plan.reach.assign(columns, Reach{});
   plan.at_plane.assign(planes, 0);
+  plan.low_row = per_plane;
+  plan.high_row = -1;
   int32_t before = EMPTY;
   int64_t run = 0, plane = 0;
   for (int64_t p = 0; p < n; p += W) {
@@ -45,6 +48,9 @@ template <class S, int D> void survey(const ToNodes& t, const S* x, const S* m, 
         r.low = std::min(r.low, z);
         r.high = std::max(r.high, z);
         plane = column / per_plane;
+        const int64_t row = column - plane * per_plane;
+        plan.low_row = std::min(plan.low_row, row);
+        plan.high_row = std::max(plan.high_row, row);
       }
       first = std::min(first, int32_t(plane));
       last = std::max(last, int32_t(plane));
@@ -79,8 +85,10 @@ template <class S, int D> struct Scatter {
   // Every column that grains reach: its number, lowest node, where that lies, and how many nodes follow.
   template <class F> void columns(int64_t from, int64_t to, F what) const {
     const int64_t wide = D == 3 ? t.grid.shape[1] : 1, tall = t.grid.shape[D - 1];
-    for (int64_t i = from; i < to; ++i)
-      for (int64_t j = 0; j < wide; ++j) {
+    for (int64_t i = from; i < to; ++i) {
+      const int64_t* here = &plan.at_plane[i];
+      if (!(*here || (i > 0 && here[-1]) || (i > 1 && here[-2]))) continue;  // an empty box costs little
+      for (int64_t j = plan.low_row; j < std::min(plan.high_row + 3, wide); ++j) {
         Reach r;
         for (int64_t a = std::max<int64_t>(i - 2, 0); a <= i; ++a)
           for (int64_t b = D == 3 ? std::max<int64_t>(j - 2, 0) : 0; b <= j; ++b) {
@@ -90,6 +98,7 @@ template <class S, int D> struct Scatter {
           }
         if (r.high >= 0) what(i * wide + j, r.low, nodes + 4 * ((i * wide + j) * tall + r.low), r.high - r.low + 4);
       }
+    }
   }
 
   // One record per grain, four numbers each: momentum and mass, and how momentum grows by one cell along each axis.

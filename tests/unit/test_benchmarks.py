@@ -138,6 +138,12 @@ def test_missed_goal_is_explained_with_the_numbers_of_the_results(
     assert "Why some were missed" not in goals.section()
 
 
+def test_empty_room_s_cost_is_that_of_the_largest_box_over_the_usual_one() -> None:
+    rows = {str(k): {"nodes": 100 * k**3, "Mpss_cpu": {"median": 6.0 / k}} for k in (1, 2, 4)}
+    assert "- xla: with 64 times as many nodes 4 times the cost" in report.room({"xla": rows})
+    assert "times" not in report.room({"xla": {"1": rows["1"]}})
+
+
 def test_box_that_only_sinks_is_not_said_to_move_up() -> None:
     assert report.upwards(-0.0022) == "never moves up"
     assert report.upwards(0.0279) == "moves up at 0.0279 m/s at most"
