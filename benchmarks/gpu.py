@@ -56,7 +56,7 @@ def cost(jaxpr: Any) -> Cost:
     """The cost of a jaxpr, loops unrolled as often as they run. Loops of unknown length count once."""
     total = Cost()
     for eqn in jaxpr.eqns:
-        inner = [cost(sub) for sub in _inside(eqn)]
+        inner = [cost(sub) for sub in inside(eqn)]
         if eqn.primitive.name == "cond":  # the dearer branch
             total += max(inner, key=lambda branch: branch.bytes)
         elif inner and not eqn.primitive.name.startswith("scatter"):
@@ -66,7 +66,7 @@ def cost(jaxpr: Any) -> Cost:
     return total
 
 
-def _inside(eqn: Any) -> Iterator[Any]:
+def inside(eqn: Any) -> Iterator[Any]:
     """The jaxprs that an equation calls."""
     for value in eqn.params.values():
         for item in value if isinstance(value, tuple | list) else (value,):

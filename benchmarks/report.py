@@ -134,18 +134,26 @@ def rigid_step(kernels: str, by_fidelity: dict[str, Any]) -> str:
 def roofline(r: dict[str, Any]) -> str:
     """What one core could do, and how far from it the substep is."""
     limit = r["limits"]
-    by_flops = limit["gflop_per_s"] * 1e3 / limit["flops_per_grain"]
+    rates = {kernels: 1e3 / scenes["column"]["whole substep"] for kernels, scenes in r["kernels"].items()}
     by_bytes = limit["gb_per_s"] * 1e3 / (2 * limit["state_bytes_per_grain"])
     text = (
-        f"**Roofline.** One core was seen to do {limit['gflop_per_s']:.0f} GFLOP/s (f32 matrix product) and"
-        f" {limit['gb_per_s']:.0f} GB/s (sum of long arrays). A substep needs {limit['flops_per_grain']:.0f} operations"
-        f" per grain as XLA counts them, and {limit['state_bytes_per_grain']:.0f} bytes of state read and written once:"
-        f" arithmetic would allow {by_flops:.0f} M/s, memory {by_bytes:.0f} M/s."
+        f"**Ceilings.** At its best one core was seen to do {limit['gflop_per_s']:.0f} GFLOP/s (f32 matrix product) and"
+        f" {limit['gb_per_s']:.0f} GB/s (sum of long arrays). Memory would allow {by_bytes:.0f} M/s, were the"
+        f" {limit['state_bytes_per_grain']:.0f} bytes of a grain's state only read and written once:"
     )
-    for kernels, scenes in r["kernels"].items():
-        rate = 1e3 / scenes["column"]["whole substep"]
-        share = 100 * rate / min(by_flops, by_bytes)
-        text += f" The {kernels} kernels reach {rate:.3g} M/s, {share:.0f} % of the lesser."
+    text += ",".join(
+        f" the {k} kernels reach {rate:.3g} M/s or {100 * rate / by_bytes:.0f} %" for k, rate in rates.items()
+    )
+    text += "."
+    if "operations_per_grain" in limit and "xla" in rates:
+        needs = limit["operations_per_grain"]
+        by_flops = limit["gflop_per_s"] * 1e3 / needs
+        text += (
+            f" Plain XLA's program has {needs:.0f} operations per grain and substep, those in loops counted as often as"
+            f" they run: arithmetic would allow {by_flops:.0f} M/s, of which it reaches"
+            f" {100 * rates['xla'] / by_flops:.0f} %. The native kernels do other arithmetic, series instead of"
+            " eigenvalues where all of a pack's strains are small, which nobody has counted."
+        )
     return text + " The stages above say where the rest goes.\n"
 
 

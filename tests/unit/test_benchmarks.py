@@ -10,12 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax import lax
 
-from benchmarks import box, goals, guard, report, stages
+from benchmarks import box, goals, guard, limits, report, stages
 from benchmarks.clock import in_turns, spread
 from benchmarks.coupled import DIG_STEPS, Run, digging
 from benchmarks.throughput import HEAPS, fit, merged, same_job
-from mpm_env.mpm import sorting
+from mpm_env.mpm import linalg3, sorting
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 
@@ -91,6 +92,27 @@ def test_sort_pays_when_what_it_saves_comes_to_what_it_costs() -> None:
     times = {"whole substep, sorted": 40.0, "whole substep, nearly sorted": 42.0, "sort, if it were done": 30.0}
     assert "after 15 substeps" in report.sort_pays(times, "dig", 0.05)
     assert "does not pay" in report.sort_pays(times | {"whole substep, nearly sorted": 39.0}, "dig", 0.05)
+
+
+def test_operations_in_loops_count_as_often_as_they_run() -> None:
+    rows, at = jnp.ones((10, 3)), jnp.zeros(10, jnp.int32)
+
+    def job(rows: jax.Array) -> jax.Array:
+        rows = lax.fori_loop(0, 7, lambda _, now: jnp.sqrt(now) + 1, rows)  # 7 x 2 x 30
+        sums = jnp.zeros((4, 3)).at[at].add(rows)  # 30
+        return jnp.sum(sums @ rows.T)  # 2 x 4 x 10 x 3, and 40; whole numbers and gathers are none
+
+    assert limits.operations(jax.make_jaxpr(job)(rows).jaxpr) == 7 * 2 * 30 + 30 + 240 + 40
+
+
+def test_more_sweeps_are_more_operations(monkeypatch: pytest.MonkeyPatch) -> None:
+    few = limits.substep_needs(4)["operations_per_grain"]
+    monkeypatch.setattr(linalg3, "SWEEPS", 2 * linalg3.SWEEPS)
+    assert limits.substep_needs(4)["operations_per_grain"] > 1.1 * few
+
+
+def test_best_of_several_looks_is_the_most_of_each() -> None:
+    assert limits.best([{"a": 1.0, "b": 4.0}, {"a": 2.0, "b": 3.0}]) == {"a": 2.0, "b": 4.0}
 
 
 def test_cost_of_a_call_is_no_part_of_a_stage(monkeypatch: pytest.MonkeyPatch) -> None:
