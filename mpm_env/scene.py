@@ -31,7 +31,7 @@ from mpm_env.scene_cache import keep_programs
 from mpm_env.scene_config import SceneConfig
 from mpm_env.scene_grains import WHOLE, axes_of, fill_of, material_of, whole
 
-SORTED_FROM = 65_536  # grains; fewer cost the same in any order that flow brings about
+SORTED_FROM = 65_536  # grains; with fewer, order saves native kernels a tenth at most, and plain XLA nothing
 OVERLAP = 0.25  # cells that a grain may start inside a body: the jitter of seeding, not a mistake
 
 
