@@ -4,6 +4,7 @@
     build, initial               a checked Scene, and its first State
     rigid_step, advance, scripted      the coupled simulation as pure functions
     run.run, demo.demo           a scene, or a task's script, to a folder of results
+    wrench_at, low_pass          what grains do to a tool, as a force-torque sensor tells it
     make_task                    a task; tasks.reset(task, key) and tasks.step(task, episode, action) are pure
 
 Importing registers the Gymnasium environments mpm_env/DigSand-v0, DigSnow-v0, PushSand-v0 and PushSnow-v0. Building a
@@ -14,6 +15,7 @@ from __future__ import annotations
 
 import os
 from importlib import import_module
+from importlib.util import find_spec
 from typing import Any
 
 import gymnasium
@@ -38,6 +40,8 @@ _HOMES = {
     "scripted": "sim",
     "rigid_step": "sim",
     "Health": "health",
+    "wrench_at": "wrench",
+    "low_pass": "wrench",
     "make_task": "tasks",
     "read_task": "tasks",
 }
@@ -46,9 +50,11 @@ __all__ = list(_HOMES)
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
-        raise AttributeError(f"module 'mpm_env' has no attribute {name!r}")
-    return getattr(import_module(f"mpm_env.{_HOMES[name]}"), name)
+    if name in _HOMES:
+        return getattr(import_module(f"mpm_env.{_HOMES[name]}"), name)
+    if not name.startswith("_") and find_spec(f"mpm_env.{name}"):
+        return import_module(f"mpm_env.{name}")
+    raise AttributeError(f"module 'mpm_env' has no attribute {name!r}")
 
 
 for _id, _task in {

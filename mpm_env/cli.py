@@ -76,10 +76,13 @@ def _add_run(commands: Any) -> None:
 
 def _run(options: argparse.Namespace) -> int:
     with refusing():
-        from mpm_env.fidelity import load_fidelity
+        from mpm_env.fidelity import Fidelity, load_fidelity
         from mpm_env.run import FILES, prepare
         from mpm_env.scene_config import read_scene
 
+        astray = [s for s in options.settings if s.partition("=")[0] in Fidelity.model_fields.keys() - {"about"}]
+        if astray:
+            raise ValueError(f"{astray[0]} is a setting of the fidelity: write --set {FOR_FIDELITY}{astray[0]}.")
         ours = [s.removeprefix(FOR_FIDELITY) for s in options.settings if s.startswith(FOR_FIDELITY)]
         config = read_scene(options.scene, tuple(s for s in options.settings if not s.startswith(FOR_FIDELITY)))
         fidelity = load_fidelity(options.fidelity or config.fidelity, ours)

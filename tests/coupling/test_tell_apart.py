@@ -70,10 +70,22 @@ def test_a_buried_box_of_any_density_lies_still_and_weighs_what_it_weighs(ratio:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scheme", [ta.explicit, ta.staggered])
-@pytest.mark.parametrize("name", ["buried", "light arm"])
-def test_explicit_schemes_shake_light_bodies_or_throw_them_about(name: str, scheme: Callable) -> None:
-    """Negative controls: impulses by the same law at the velocity without contact, paid at once or after the step."""
-    done = ta.told_apart(name, scheme, 100)
-    calm = done.fastest < WILD * (TOLD if name == "light arm" else CALM)  # not so what is not a number
-    assert not (calm and done.noise < NOISE)
+@pytest.mark.parametrize(
+    ("name", "scheme"),
+    [
+        ("buried", ta.explicit),
+        ("at the wall", ta.explicit),
+        ("on the floor", ta.explicit),
+        ("buried", ta.staggered),
+        ("at the wall", ta.staggered),
+        ("on the floor", ta.staggered),
+        ("light arm", ta.staggered),
+    ],
+)
+def test_explicit_schemes_throw_light_bodies_about(name: str, scheme: Callable) -> None:
+    """Negative controls: impulses by the same law at the velocity without contact, paid at once or after the step.
+
+    Paid at once they do hold the squeezing boxes and the arm: their motors and joints weigh enough.
+    """
+    fastest = ta.told_apart(name, scheme, 100).fastest
+    assert not fastest < WILD * (TOLD if name == "light arm" else CALM)  # also what is not a number; 218 and more seen

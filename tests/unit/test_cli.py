@@ -30,6 +30,7 @@ REFUSED = {
     ("box_drop", "--fidelity", "none.yaml"): "There is no file none.yaml.",
     ("box_drop", "--set", "grains.0.material=mud"): "There is no material 'mud'.",
     ("box_drop", "--set", "fidelity.cell=4"): "unknown key 'cell': did you mean 'cells'?",
+    ("box_drop", "--set", "two_way=false"): "write --set fidelity.two_way=false",
     ("box_drop", "--set", "duration"): "A setting is key=value, got 'duration'.",
     ("box_drop", "--set", "duration=.nan"): "duration should be a finite number, got nan.",
     ("box_drop", "--set", "bodies.couple=[bax]"): "no geom named 'bax': did you mean 'box'?",
