@@ -45,10 +45,10 @@ WIDER = (
     "Nodes up to a quarter of a cell off a body feel it (`contact_band`), beside the grains that touch it, and a wider"
     " band pushes harder; and the references have not converged: against the finer one, misses are a tenth larger"
 )
-BY_GRID = (2.0, 4.0)  # cells thick, from which on the grid alone may stop the sand
+BY_GRID = (2.5, 4.0)  # cells thick, from which on the grid alone may stop the sand
 FORCES = [
     Band("over_reference", low, high, WIDER, {"thick_cells": thick})
-    for thick in (*THICK, *BY_GRID[1:])
+    for thick in (*THICK, *BY_GRID)
     for low, high in [(0.8, 1.2) if thick < 1 else (0.9, 1.1)]
 ]
 
