@@ -24,7 +24,8 @@ where the grains last saw the bodies.
   with grains all around, the node tells how far away their surface is, and meets the body when that gap closes.
   Gaps under a quarter of a cell count as none.
 - **Thin tools.** `push_out: false` looks at grid nodes only, costs least, and is refused for geoms thinner than 2.5
-  cells, since at 2 cells 3 % of the sand passes. `push_out: true`, the default, also stops every grain that entered a body and puts it back to the surface.
+  cells, since through 2 cells 3 % of the sand passes. `push_out: true`, the default, also stops every grain that
+  entered a body and puts it back to the surface.
 - **One way.** `two_way: false` moves bodies as if there were no grains and solves nothing; wrenches are still told.
 - **Reports.** `State.contact` tells each rigid step's deepest grain, peak force, momentum that did not close, share of
   the equation left, and how far MJX's end was from the one that grains saw; all but the force have a health bit.

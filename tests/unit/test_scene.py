@@ -105,7 +105,7 @@ REFUSED: dict[str, tuple[dict[str, Any], dict[str, Any], tuple[str, ...]]] = {
     "a tool too thin for the grid": (
         {"bodies": {}},
         {"cells": 3, "push_out": False},
-        ("The geom 'paddle' is", "cells thick", "leak through geoms thinner than 2", "push_out = true"),
+        ("The geom 'paddle' is", "cells thick", "leak through geoms thinner than 2.5", "push_out = true"),
     ),
     "unknown actuator": (
         {"bodies": {"controls": {"driv": [[0, 1]]}}},
