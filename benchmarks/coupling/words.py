@@ -4,7 +4,8 @@ HEAD = """# Contact between grains and bodies
 
 How sand and MuJoCo bodies exchange momentum, and what was measured of it. Made by `make coupling` from \
 `benchmarks/results/coupling_*.json`; not written by hand. Scenes and measures are in `benchmarks/coupling`; tests in \
-`tests/coupling` run them small. f32, native kernels, sand of E = 1 MPa and 35 degrees, unless said. Bands that are \
+`tests/coupling` run them small; the recordings of the pictures go to `coupling_out/*.rrd`, for `mpm-env replay FILE \
+--view`. f32, native kernels, sand of E = 1 MPa and 35 degrees, unless said. Bands that are \
 missed stay in the tables.
 
 """
