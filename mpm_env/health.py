@@ -47,7 +47,7 @@ SENTENCES: dict[Health, str] = {
 
 
 class ContactReport(NamedTuple):
-    """How contact went in a rigid step: numbers to watch; all but the peak have a health bit for when it is too much."""
+    """How contact went in a rigid step: numbers to watch, all but the peak with a health bit for too much."""
 
     depth: Array  # () m, deepest grain inside a body before it was stopped
     peak: Array  # () N, largest force on the bodies over a substep; with the mean force, how rough contact is
