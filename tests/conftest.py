@@ -1,9 +1,13 @@
 """What every test runs under. Set here, before anything imports JAX, which reads its environment once."""
 
+import gc
 import os
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import hypothesis
+import pytest
 
 # Tests compare with float64 oracles and to the bit across runs: the CPU, unless someone asks for a GPU.
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
@@ -18,3 +22,13 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 # The first example of a shape compiles, so a deadline measures nothing; the same examples on every machine.
 hypothesis.settings.register_profile("house", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("house")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def programs_go_with_their_file() -> Iterator[None]:
+    """Compiled programs take hundreds of memory maps each, of which a process has 65 530: past that XLA aborts."""
+    yield
+    jax = sys.modules.get("jax")
+    if jax is not None:
+        jax.clear_caches()
+        gc.collect()
