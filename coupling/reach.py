@@ -34,13 +34,15 @@ def points_near(
         if not mine:
             continue
         lows, highs = np.asarray([_box_around(b, d, i) for i in mine]).swapaxes(0, 1)
-        ends = zip(lows.min(0) - high, highs.max(0) + high, strict=True)
-        axes = [np.arange(lo + step / 2, hi + step / 2, step) for lo, hi in ends]  # middles, so none lies on the edge
-        if middle is not None:
-            axes[1] = np.asarray([middle])
-        phi = distances_from(b, d, mine, np.stack(np.meshgrid(*axes, indexing="ij")).reshape(3, -1))
-        per_point = 8 if middle is None else 4
-        total += [-(-np.count_nonzero((phi > low) & (phi < top)) // per_point) for low, top in bands]
+        ends = list(zip(lows.min(0) - high, highs.max(0) + high, strict=True))
+        counts = []
+        for shift in (0, step / 2):  # a lattice may lie on the edges of a plate's band, and miss them all by a hair
+            axes = [np.arange(lo + shift, hi + step - shift, step) for lo, hi in ends]
+            if middle is not None:
+                axes[1] = np.asarray([middle])
+            phi = distances_from(b, d, mine, np.stack(np.meshgrid(*axes, indexing="ij")).reshape(3, -1))
+            counts.append([np.count_nonzero((phi > low) & (phi < top)) for low, top in bands])
+        total += -(-np.max(counts, axis=0) // (8 if middle is None else 4))
     return tuple(int(n) for n in total)
 
 
