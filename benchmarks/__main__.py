@@ -6,11 +6,8 @@ python -m benchmarks [--quick] [--keep] [--peers VENVS] [SUITE ...]
 from __future__ import annotations
 
 import argparse
-import subprocess
-import sys
-import time
 
-from benchmarks import machine
+from benchmarks import suites
 
 SUITES = {  # suite -> options of a full and of a quick run
     "throughput": ([], ["--quick"]),
@@ -32,21 +29,12 @@ def main() -> None:
     a = parser.parse_args()
     if unknown := set(a.suites) - set(SUITES):
         parser.error(f"there is no suite {', '.join(sorted(unknown))}: use {', '.join(SUITES)}")
-    failed = []
-    for suite in a.suites or SUITES:
-        options = list(SUITES[suite][a.quick])
-        if suite in ("compare", "coupled") and a.peers:
-            options += ["--peers", a.peers]
-        if suite == "guard" and a.keep:
-            options.append("--keep")
-        began = time.perf_counter()
-        done = subprocess.run([sys.executable, "-m", f"benchmarks.{suite}", *options], cwd=machine.ROOT, check=False)
-        print(f"{suite}: {time.perf_counter() - began:.0f} s", flush=True)
-        if done.returncode:
-            failed.append(suite)
-    subprocess.run([sys.executable, "-m", "benchmarks.report"], cwd=machine.ROOT, check=True)
-    if failed:
-        sys.exit(f"failed: {', '.join(failed)}")
+    options = {suite: list(SUITES[suite][a.quick]) for suite in a.suites or SUITES}
+    for suite in options.keys() & {"compare", "coupled"}:
+        options[suite] += ["--peers", a.peers] if a.peers else []
+    if "guard" in options and a.keep:
+        options["guard"].append("--keep")
+    suites.run("benchmarks", options)
 
 
 if __name__ == "__main__":

@@ -44,77 +44,64 @@ class WallConfig(Section):
         return self
 
 
-class ElasticConfig(Section):
-    """Elastic solid."""
+class SolidConfig(Section):
+    """What every material has; rho is that of the bed."""
 
-    model: Literal["elastic"]
-    about: str = ""
-    E: Positive  # Pa
-    nu: Annotated[float, Field(gt=-1, lt=0.5)]
-    rho: Positive  # kg/m^3
-
-
-class SandConfig(Section):
-    """Drucker-Prager sand."""
-
-    model: Literal["sand"]
+    model: str
     about: str = ""
     E: Positive  # Pa
     nu: Annotated[float, Field(ge=0, lt=0.5)]
     rho: Positive  # kg/m^3
+
+
+class ElasticConfig(SolidConfig):
+    """Elastic solid."""
+
+    model: Literal["elastic"]
+    nu: Annotated[float, Field(gt=-1, lt=0.5)]
+
+
+class SandConfig(SolidConfig):
+    """Drucker-Prager sand."""
+
+    model: Literal["sand"]
     friction_deg: Annotated[float, Field(ge=0, lt=90)]
     friction_fit: Literal["triaxial", "plane_strain", "mc2d"] = "triaxial"  # "mc2d": plane strain only
     cohesion: NotNegative = 0.0  # Pa
     volume_correction: bool = True
 
 
-class SnowConfig(Section):
+class SnowConfig(SolidConfig):
     """Stomakhin snow."""
 
     model: Literal["snow"]
-    about: str = ""
-    E: Positive  # Pa
-    nu: Annotated[float, Field(ge=0, lt=0.5)]
-    rho: Positive  # kg/m^3
     theta_c: Annotated[float, Field(gt=0, lt=1)]
     theta_s: Annotated[float, Field(gt=0, lt=1)]
     xi: NotNegative
     Jp_min: Annotated[float, Field(gt=0, le=1)] = 0.8
 
 
-class VonMisesConfig(Section):
+class VonMisesConfig(SolidConfig):
     """Metal-like solid with linear hardening."""
 
     model: Literal["von_mises"]
-    about: str = ""
-    E: Positive  # Pa
-    nu: Annotated[float, Field(ge=0, lt=0.5)]
-    rho: Positive  # kg/m^3
     yield_stress: Positive  # Pa, uniaxial
     hardening: NotNegative = 0.0  # Pa
 
 
-class HerschelBulkleyConfig(Section):
+class HerschelBulkleyConfig(SolidConfig):
     """Viscoplastic mud, paste or foam."""
 
     model: Literal["herschel_bulkley"]
-    about: str = ""
-    E: Positive  # Pa
-    nu: Annotated[float, Field(ge=0, lt=0.5)]
-    rho: Positive  # kg/m^3
     yield_stress: NotNegative  # Pa, in shear
     consistency: NotNegative  # Pa s^flow_index
     flow_index: Annotated[float, Field(ge=0.1, le=10)] = 1.0
 
 
-class MuIConfig(Section):
+class MuIConfig(SolidConfig):
     """Granular flow with the friction mu(I)."""
 
     model: Literal["mu_i"]
-    about: str = ""
-    E: Positive  # Pa
-    nu: Annotated[float, Field(ge=0, lt=0.5)]
-    rho: Positive  # kg/m^3, of the bed
     mu_s: Positive
     mu_2: Positive
     I_0: Positive
@@ -129,14 +116,10 @@ class MuIConfig(Section):
         return self
 
 
-class CamClayConfig(Section):
+class CamClayConfig(SolidConfig):
     """Cam-Clay snow or soil that hardens, softens and breaks."""
 
     model: Literal["cam_clay"]
-    about: str = ""
-    E: Positive  # Pa
-    nu: Annotated[float, Field(ge=0, lt=0.5)]
-    rho: Positive  # kg/m^3
     M: Positive
     beta: NotNegative
     xi: Positive

@@ -6,12 +6,9 @@ python -m benchmarks.coupling [--quick] [--out coupling_out] [PART ...]
 from __future__ import annotations
 
 import argparse
-import subprocess
-import sys
-import time
 from pathlib import Path
 
-from benchmarks import machine
+from benchmarks import suites
 
 PARTS = ("tell_apart", "drop", "blade", "penetration", "refined", "cost", "pictures")
 
@@ -25,18 +22,9 @@ def main() -> None:
     a = parser.parse_args()
     if unknown := set(a.parts) - set(PARTS):
         parser.error(f"there is no part {', '.join(sorted(unknown))}: use {', '.join(PARTS)}")
-    failed = []
-    for name in a.parts or PARTS:
-        options = ["--quick"] * a.quick + (["--out", str(Path(a.out).resolve())] if name == "pictures" else [])
-        began = time.perf_counter()
-        command = [sys.executable, "-m", f"benchmarks.coupling.{name}", *options]
-        done = subprocess.run(command, cwd=machine.ROOT, check=False)
-        print(f"{name}: {time.perf_counter() - began:.0f} s", flush=True)
-        if done.returncode:
-            failed.append(name)
-    subprocess.run([sys.executable, "-m", "benchmarks.coupling.report"], cwd=machine.ROOT, check=True)
-    if failed:
-        sys.exit(f"failed: {', '.join(failed)}")
+    out = ["--out", str(Path(a.out).resolve())]
+    options = {name: ["--quick"] * a.quick + out * (name == "pictures") for name in a.parts or PARTS}
+    suites.run("benchmarks.coupling", options)
 
 
 if __name__ == "__main__":
