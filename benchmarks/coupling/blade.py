@@ -15,11 +15,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from benchmarks import part
 from benchmarks.clock import significant
-from benchmarks.coupling import part
 from benchmarks.coupling.beds import without
-from benchmarks.coupling.part import Band
 from benchmarks.coupling.scenes import ROWS, Bed, Pose, about, planted, ride, settled, soft_travel, trouble
+from benchmarks.part import Band
 from mpm_env import Scene, State
 
 LENGTH, DEPTH, INTO = 0.8, 0.2, 0.1  # m
@@ -212,4 +212,4 @@ def measure(quick: bool) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    part.main("blade", measure, __doc__)
+    part.main("coupling_blade", measure, __doc__)

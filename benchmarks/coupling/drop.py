@@ -13,10 +13,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.coupling import part
+from benchmarks import part
 from benchmarks.coupling.beds import RHO, G, lighter
-from benchmarks.coupling.part import Band, kept
 from benchmarks.coupling.scenes import Bed, body_energy, run, settled, shifted, trouble
+from benchmarks.part import Band, kept
 from mpm_env import State
 
 RATIOS = (0.01, 0.1, 1.0, 10.0, 100.0)  # density of the box over that of sand
@@ -169,4 +169,4 @@ def measure(quick: bool) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    part.main("drop", measure, __doc__)
+    part.main("coupling_drop", measure, __doc__)

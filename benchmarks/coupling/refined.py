@@ -17,12 +17,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from benchmarks import part
 from benchmarks.clock import significant
-from benchmarks.coupling import part
 from benchmarks.coupling import tell_apart as ta
 from benchmarks.coupling.drop import drop
-from benchmarks.coupling.part import Band
 from benchmarks.coupling.scenes import Bed, run, trouble
+from benchmarks.part import Band
 
 DX = 0.025  # m
 H = 2.5e-4  # s, of a substep: half of what the sound speed allows
@@ -97,4 +97,4 @@ def measure(quick: bool) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    part.main("refined", measure, __doc__)
+    part.main("coupling_refined", measure, __doc__)

@@ -9,7 +9,6 @@ import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from benchmarks import machine, results
-from benchmarks.coupling.part import Band, Row, bands_of, misses
 from benchmarks.coupling.words import (
     COST,
     DROP,
@@ -23,6 +22,7 @@ from benchmarks.coupling.words import (
     SCHEME,
     SCHEMES,
 )
+from benchmarks.part import Band, Row, bands_of, misses
 from benchmarks.report import table
 
 OUT = machine.ROOT / "docs" / "coupling.md"

@@ -18,10 +18,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.coupling import part
+from benchmarks import part
 from benchmarks.coupling.beds import lighter
-from benchmarks.coupling.part import Band, kept
 from benchmarks.coupling.scenes import Bed, Steps, run, trouble
+from benchmarks.part import Band, kept
 from coupling import meeting
 from coupling.contact import Points, Surface
 from coupling.exchange import Exchange, Twists, exchange
@@ -223,4 +223,4 @@ def measure(quick: bool) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    part.main("tell_apart", measure, __doc__)
+    part.main("coupling_tell_apart", measure, __doc__)

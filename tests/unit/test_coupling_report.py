@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks import machine, results
 from benchmarks.coupling import report
-from benchmarks.coupling.part import Band, kept
+from benchmarks.part import Band, kept
 
 ABOUT = {"commit": "abc1234", "date": "2026-01-01", "cpu": "a core", "cores": 1, "versions": "jax 0"}
 

@@ -1,4 +1,4 @@
-"""A part of the benchmarks of coupling: rows of numbers, the bands they are to lie in, and where both are kept."""
+"""A part of benchmarks against references: rows of numbers, bands they are to lie in, and where both are kept."""
 
 from __future__ import annotations
 
@@ -67,10 +67,10 @@ def say(row: Row) -> Row:
 
 
 def main(name: str, measure: Callable[[bool], dict[str, Any]], about: str) -> None:
-    """Measure a part and write results/coupling_<name>.json."""
+    """Measure a part and write results/<name>.json."""
     parser = argparse.ArgumentParser(description=about.partition("\n")[0])
     parser.add_argument("--quick", action="store_true", help="fewer and coarser runs")
     quick = parser.parse_args().quick
     began = time.perf_counter()
     content = measure(quick)
-    results.write(f"coupling_{name}", {"quick": quick, "wall_s": round(time.perf_counter() - began), **content})
+    results.write(name, {"quick": quick, "wall_s": round(time.perf_counter() - began), **content})
