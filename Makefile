@@ -14,7 +14,7 @@ RIGHT_VERSION := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3,
 WILL_DO := import ensurepip, venv; $(RIGHT_VERSION)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo bench guard coupling test test-xla test-fast lint format pins clean
+.PHONY: help setup demo bench guard coupling validation test test-xla test-fast lint format pins clean
 
 help:  ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /\1: /p' $(MAKEFILE_LIST) | awk -F': ' '{ printf "  make %-10s %s\n", $$1, $$2 }'
@@ -32,6 +32,9 @@ guard: $(READY)  ## has a substep become slower than the ratio kept? (ARGS=--kee
 
 coupling: $(READY)  ## contact measured, into docs/coupling.md (ARGS=--quick; ARGS="drop blade" runs some parts)
 	$(BIN)/python -m benchmarks.coupling $(ARGS)
+
+validation: $(READY)  ## grains against references, into docs/validation.md (ARGS=--quick; ARGS="motion" runs some parts)
+	$(BIN)/python -m benchmarks.validation $(ARGS)
 
 test: $(READY)  ## all tests, a process per core
 	$(BIN)/python -m pytest -n auto --dist loadfile $(ARGS)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 
@@ -20,3 +20,17 @@ def brief(value: dict[str, float] | float | None) -> str:
     if isinstance(value, dict):
         return f"{value['median']:.3g} [{value['min']:.3g}, {value['max']:.3g}]"
     return f"{value:.3g}"
+
+
+def span(values: Iterable[float | None], how: Callable[[float | None], str]) -> str:
+    """From the least to the most."""
+    values = list(values)
+    if None in values:
+        return "not finite"
+    low, high = how(min(values)), how(max(values))
+    return low if low == high else f"{low} to {high}"
+
+
+def marked(text: str, outside: bool) -> str:
+    """Text that stands out where a band is missed."""
+    return f"**{text}** (missed)" if outside else text

@@ -2,12 +2,24 @@
 
 from __future__ import annotations
 
+import argparse
 import subprocess
 import sys
 import time
 from collections.abc import Mapping, Sequence
 
 from benchmarks import machine
+
+
+def asked(parser: argparse.ArgumentParser, parts: Sequence[str]) -> argparse.Namespace:
+    """The command line's options, with the `parts` to run, all of them if none is named, and whether `quick`."""
+    parser.add_argument("parts", nargs="*", metavar="PART", help=f"{', '.join(parts)}; default: all")
+    parser.add_argument("--quick", action="store_true", help="fewer and coarser runs")
+    a = parser.parse_args()
+    if unknown := set(a.parts) - set(parts):
+        parser.error(f"there is no part {', '.join(sorted(unknown))}: use {', '.join(parts)}")
+    a.parts = a.parts or list(parts)
+    return a
 
 
 def run(package: str, suites: Mapping[str, Sequence[str]]) -> None:

@@ -16,14 +16,10 @@ PARTS = ("tell_apart", "drop", "blade", "penetration", "refined", "cost", "pictu
 def main() -> None:
     """Run the parts asked for; a part that fails does not stop the others, but the exit status."""
     parser = argparse.ArgumentParser(description="Measure contact between grains and bodies; write docs/coupling.md.")
-    parser.add_argument("parts", nargs="*", metavar="PART", help=f"{', '.join(PARTS)}; default: all")
-    parser.add_argument("--quick", action="store_true", help="fewer and coarser runs")
     parser.add_argument("--out", default="coupling_out", metavar="FOLDER", help="where the pictures' recordings go")
-    a = parser.parse_args()
-    if unknown := set(a.parts) - set(PARTS):
-        parser.error(f"there is no part {', '.join(sorted(unknown))}: use {', '.join(PARTS)}")
+    a = suites.asked(parser, PARTS)
     out = ["--out", str(Path(a.out).resolve())]
-    options = {name: ["--quick"] * a.quick + out * (name == "pictures") for name in a.parts or PARTS}
+    options = {name: ["--quick"] * a.quick + out * (name == "pictures") for name in a.parts}
     suites.run("benchmarks.coupling", options)
 
 

@@ -11,19 +11,18 @@ from __future__ import annotations
 import argparse
 import itertools
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from benchmarks import job, machine, results
-from benchmarks.clock import significant
+from benchmarks.case import Band, Case, say, within
 from benchmarks.coupling import cutting, impact, intrusion
 from benchmarks.coupling.fits import line
 from benchmarks.coupling.intrusion import ALONG_FLAT, ALONG_UPRIGHT, DOWN, UP, UP_DEEPER
 from mpm_env.plot import Series, plot
 
 PLOTS = machine.ROOT / "docs" / "coupling"
-Band = tuple[float, float]  # the values that agree with a reference
 FRICTIONS = (20.0, 25.0, 30.0, 35.0, 40.0)  # degrees
 UEHARA, BRZINSKI, RFT = "Uehara et al. 2003", "Brzinski et al. 2013", "Li, Zhang & Goldman 2013"
 COARSE = (
@@ -44,38 +43,6 @@ SHALLOW = (
     "What lifts a shallow plate is the weight of the block above it, which grows with depth squared and more; what it"
     " bears grows with depth. In a continuum with friction the ratio falls with depth and is no constant"
 )
-
-
-class Case(NamedTuple):
-    """A number held against its reference."""
-
-    name: str
-    source: str
-    reference: float
-    band: Band
-    value: float
-    resolution: str
-    cpu_s: float  # of all runs behind it
-    health: int
-    note: str = ""  # where it misses: what is known about why
-
-    def told(self) -> dict[str, Any]:
-        """The case as it is kept."""
-        holds = self.band[0] <= self.value <= self.band[1] and self.health == 0
-        return self._asdict() | {
-            "reference": significant(self.reference),
-            "band": [significant(b) for b in self.band],
-            "value": significant(self.value),
-            "error": significant(self.value / self.reference - 1, 3),
-            "cpu_s": significant(self.cpu_s, 3),
-            "verdict": "holds" if holds else "misses",
-            "note": "" if holds else self.note,
-        }
-
-
-def within(reference: float, share: float) -> Band:
-    """The band of so large a share on both sides of a reference."""
-    return reference * (1 - share), reference * (1 + share)
 
 
 def balls(cells: tuple[int, ...]) -> list[Case]:
@@ -274,10 +241,7 @@ def main() -> None:
         footings,
         partial(dropped, quick),
     ):
-        for case in (c.told() for c in cases()):
-            value, reference = case["value"], case["reference"]
-            print(f"{case['verdict']:7}{case['name']:50}{value:9.4g}{reference:9.4g}  {case['resolution']}", flush=True)
-            told.append(case)
+        told += say(cases())
     results.write("coupling_penetration", {"quick": quick, "cases": told})
 
 

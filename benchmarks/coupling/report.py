@@ -5,10 +5,9 @@ python -m benchmarks.coupling.report
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
-from benchmarks import machine, results
+from benchmarks import case, machine, results
 from benchmarks.coupling.words import (
     COST,
     DROP,
@@ -22,8 +21,8 @@ from benchmarks.coupling.words import (
     SCHEME,
     SCHEMES,
 )
+from benchmarks.marks import marked, span, table
 from benchmarks.part import Band, Row, bands_of, misses
-from benchmarks.report import table
 
 OUT = machine.ROOT / "docs" / "coupling.md"
 FORMATS = {"weight": "{:.3f}", "rests_cells": "{:.2f}", "scatter_cells": "{:.2f}"}  # where two digits say too little
@@ -35,20 +34,6 @@ def brief(value: float | None) -> str:
     if value is None:
         return "not finite"
     return f"{value:.0f}" if abs(value) >= 100 else f"{value:.2g}"
-
-
-def span(values: Iterable[float | None], how: Callable[[float | None], str] = brief) -> str:
-    """From the least to the most."""
-    values = list(values)
-    if None in values:
-        return "not finite"
-    low, high = how(min(values)), how(max(values))
-    return low if low == high else f"{low} to {high}"
-
-
-def marked(text: str, outside: bool) -> str:
-    """Text that stands out where a band is missed."""
-    return f"**{text}** (missed)" if outside else text
 
 
 def seen(result: Row, rows: Sequence[Row], measure: str) -> str:
@@ -210,34 +195,10 @@ def _force(rows: Sequence[Row], stretch: str, bands: Sequence[Band]) -> str:
 
 
 def penetration(r: Row) -> str:
-    """Bodies that go into sand: cases that differ in the angle of friction alone share a row."""
-    groups: dict[tuple[str, str, str], list[Row]] = {}
-    for case in r["cases"]:
-        name = re.sub(r",? phi [\d.]+", "", case["name"])
-        groups.setdefault((name, case["source"], case["resolution"]), []).append(case)
-    rows = []
-    for (name, source, resolution), cases in groups.items():
-        several = f" ({len(cases)} angles)" if len(cases) > 1 else ""
-        off = [100 * case["error"] for case in cases]
-        out = any(case["verdict"] == "misses" for case in cases)
-        value, reference = (span((case[k] for case in cases), lambda v: f"{v:.3g}") for k in ("value", "reference"))
-        error = marked(span(off, lambda v: f"{round(v or 0):+d} %"), out)
-        rows.append([name + several, source, resolution, reference, value, error])
-    text = PENETRATION + table(["case", "reference", "resolution", "it says", "measured", "off"], rows) + "\n"
-    wrong = [case for case in r["cases"] if case["verdict"] == "misses"]
-    text += f"{len(r['cases']) - len(wrong)} of {len(r['cases'])} cases lie in the band of their reference.\n\n"
-    by_note: dict[str, list[Row]] = {}
-    for case in wrong:
-        by_note.setdefault(case["note"] or "Why is not known", []).append(case)
-    for note, cases in by_note.items():
-        told = "; ".join(
-            f"{c['name']} ({c['resolution']}): {c['value']:.3g}, not {c['band'][0]:.3g} to {c['band'][1]:.3g}"
-            for c in cases
-        )
-        text += f"- **Missed**: {told}. {note}.\n"
+    """Bodies that go into sand."""
+    text = PENETRATION + case.table_of(r["cases"]) + "\n" + case.missed(r["cases"])
     plots = [f"![{name}](coupling/penetration_{name}.png)" for name in PLOTS]
-    rows = [plots[2:]]
-    return text + "\n" + table(plots[:2], rows) + "\n"
+    return text + "\n" + table(plots[:2], [plots[2:]]) + "\n"
 
 
 def refined(r: Row) -> str:

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from jax import Array, lax
 
+from benchmarks.validation.blocks import alive, block, box, example, lattice, longest_step
 from mpm_env.mpm.materials import MuI
 from mpm_env.mpm.substep import Bed, substep
 from mpm_env.mpm.types import MARGIN, Particles, Wall
-from tests.physics.blocks import alive, block, box, example, lattice, longest_step
 
 ACROSS, HIGH = 4, 24  # periodic cells along the slope, and cells of depth 1
 DX = 1 / HIGH

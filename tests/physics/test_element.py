@@ -6,10 +6,10 @@ import jax
 import numpy as np
 import pytest
 
+from benchmarks.validation.blocks import PARAMETERS, example
 from mpm_env import element
 from mpm_env.element import TESTS, Curve
 from mpm_env.mpm.materials.sand import FRICTION_FITS
-from tests.physics.blocks import PARAMETERS, example
 
 PRESSURE = 2e3  # Pa
 ANGLE = 0.01  # degrees off the closed form; 0.003 observed, of plane strain, which creeps to its end

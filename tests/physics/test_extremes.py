@@ -6,11 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from benchmarks.validation.blocks import GRAVITY, alive, balance, block, box, example, go, lattice, longest_step, update
 from mpm_env.mpm.budgets import mass_that_left, total
 from mpm_env.mpm.materials import MATERIALS, Material
 from mpm_env.mpm.stability import SAFETY
 from mpm_env.mpm.types import MARGIN, Particles, Wall
-from tests.physics.blocks import GRAVITY, alive, balance, block, box, example, go, lattice, longest_step, update
 
 GRID = box((16, 16, 16), 1 / 16)
 DX = GRID.cell_size

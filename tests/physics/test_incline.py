@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from benchmarks.validation.blocks import GRAVITY, block, box, example, go, lattice, longest_step
 from mpm_env.mpm.types import Wall
-from tests.physics.blocks import GRAVITY, block, box, example, go, lattice, longest_step
 
 FRICTION_DEG = 15.0
 SLIDE = 1e-3  # relative after 5 s; 5.7e-4 observed, nearly all of it the first 2 ms until the block's base is sheared

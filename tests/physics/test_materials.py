@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from jax import Array
 
+from benchmarks.validation.blocks import PARAMETERS, PATIENCE, example, update
 from mpm_env.mpm.materials import MATERIALS, Material
-from tests.physics.blocks import PARAMETERS, PATIENCE, example, update
 from tests.physics.oracles import ORACLES, rotations, rows, tensors, turned
 
 N = 256  # grains side by side: one shape, one program per material, dimension and precision

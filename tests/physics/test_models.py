@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from benchmarks.validation.blocks import PARAMETERS, example, update
 from mpm_env import element
 from mpm_env.mpm.materials import Material
-from tests.physics.blocks import PARAMETERS, example, update
 from tests.physics.oracles import lame
 
 LINE = 1e-6  # of the yield stress; 1e-8 observed, the confining pressure's share

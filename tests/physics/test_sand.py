@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from jax import Array, lax
 
+from benchmarks.validation.blocks import example, update
 from mpm_env.mpm.materials import Material, Sand
-from tests.physics.blocks import example, update
 from tests.physics.oracles import rows, sand, tensors
 
 VECTOR = {"float32": 2e-6, "float64": 2e-10}  # relative; 3e-7, 3e-11 (the digits given) observed

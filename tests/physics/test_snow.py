@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from benchmarks.validation.blocks import PARAMETERS, example, update
 from mpm_env.mpm.materials import Material
-from tests.physics.blocks import PARAMETERS, example, update
 from tests.physics.oracles import lame
 
 VECTOR = {"float32": 2e-6, "float64": 3e-10}  # relative; 4e-7, 6e-11 (the digits given) observed

@@ -6,10 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from benchmarks.validation.blocks import alive, block, box, example, go, lattice, update
 from mpm_env.mpm.materials import Material
 from mpm_env.mpm.stability import SAFETY, courant_limit
 from mpm_env.mpm.types import Grid, Particles
-from tests.physics.blocks import alive, block, box, example, go, lattice, update
 
 LONE = (0.99, 1.01)  # of the closed form: a lone grain is stable at the first and not at the second
 GROWTH = 10.0  # of the first speeds; what is stable decays, what is not grows without bound

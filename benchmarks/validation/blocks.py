@@ -1,4 +1,4 @@
-"""Blocks of grains in a box and one compiled walk through many substeps: what every physics test starts from."""
+"""Blocks of grains in a box and one compiled walk through many substeps, for validation and for tests of physics."""
 
 from dataclasses import replace
 from functools import partial

@@ -1,0 +1,82 @@
+"""docs/validation.md from the results: every measured number in it is read from a file in benchmarks/results.
+
+python -m benchmarks.validation.report
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
+
+from benchmarks import case, machine, results
+from benchmarks.coupling.report import where
+from benchmarks.part import Row
+
+OUT = machine.ROOT / "docs" / "validation.md"
+
+HEAD = """# Validation
+
+What the grains are worth: numbers held against exact cases, experiments, and laws that every right answer obeys. Made \
+by `make validation` from `benchmarks/results/validation_*.json`; not written by hand. Scenes are in \
+`benchmarks/validation`; tests in `tests/physics` run them small, each with a control that fails. Bands were stated \
+before measuring and say how far a correct code of this kind may be off; one outside its band is marked, with what is \
+known about why. CPU seconds are of one core, without compiling, for all runs behind a number.
+
+"""
+
+
+class Section(NamedTuple):
+    """What the page says of a part."""
+
+    title: str
+    words: str  # what is done, in a few sentences
+    plots: Mapping[str, str] = {}  # file in docs/validation -> caption
+
+
+SECTIONS: dict[str, Section] = {  # part -> what is said of it; the parts run in this order
+    "motion": Section("What motion keeps", "An elastic block turns about its centre, far from any wall."),
+}
+CONTACT = Section(
+    "Contact with bodies",
+    "Measured by `make coupling`, where scenes and plots are told: [coupling.md](coupling.md).",
+)
+
+
+def contact(parts: Mapping[str, Row | None]) -> Iterator[dict[str, Any]]:
+    """Cases from the results of coupling: those of penetration as they are, of others the measures that have bands."""
+    yield from (parts.get("penetration") or {}).get("cases", [])
+
+
+def section(told: Section, cases: list[dict[str, Any]]) -> str:
+    """A part's text."""
+    plots = "".join(f"![{caption}](validation/{name})\n\n{caption}\n\n" for name, caption in told.plots.items())
+    return f"{told.words}\n\n{case.table_of(cases)}\n{case.missed(cases)}\n{plots}"
+
+
+def render(parts: Mapping[str, Row | None], coupling: Mapping[str, Row | None]) -> str:
+    """The page, from the results of the parts and of coupling's; a part that has none is said to be missing."""
+    text = HEAD
+    for name, told in SECTIONS.items():
+        text += f"## {told.title}\n\n"
+        if (r := parts.get(name)) is None:
+            text += f"Not measured yet: `python -m benchmarks.validation {name}`.\n\n"
+            continue
+        text += section(told, r["cases"]) + where(r) + "\n\n"
+    cited = list(contact(coupling))
+    return text + (f"## {CONTACT.title}\n\n{section(CONTACT, cited)}" if cited else "")
+
+
+def kept() -> tuple[dict[str, Row | None], dict[str, Row | None]]:
+    """The results of the parts, and of those of coupling that the page cites."""
+    parts = {name: results.read(f"validation_{name}") for name in SECTIONS}
+    return parts, {"penetration": results.read("coupling_penetration")}
+
+
+def main() -> None:
+    """Write docs/validation.md from whatever results there are."""
+    OUT.write_text(render(*kept()))
+    print(f"wrote {OUT.relative_to(machine.ROOT)}")
+
+
+if __name__ == "__main__":
+    main()
