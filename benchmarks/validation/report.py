@@ -35,6 +35,20 @@ class Section(NamedTuple):
 
 SECTIONS: dict[str, Section] = {  # part -> what is said of it; the parts run in this order
     "motion": Section("What motion keeps", "An elastic block turns about its centre, far from any wall."),
+    "bars": Section(
+        "Bars that ring",
+        "A standing wave in a bar that is round on itself, and the first mode of one held by a sticking wall at one end"
+        " and free at the other. Strains of 1e-4.",
+        {"bars.png": "Pitch over cells; lines of second and first order"},
+    ),
+    "discs": Section(
+        "Discs",
+        "Two elastic discs fly into each other and part again (E = 1 kPa, 1 t/m^3, each at 0.14 m/s; sound runs at"
+        " 1.16 m/s). Grains meet through nodes that both reach, so before their edges do. A disc that spins grows by"
+        " what centrifugal stress does to it, and by no more however long it spins: `(1 + dt C) F` would, by"
+        " `omega^2 dt` a second, if no stress opposed it.",
+        {"discs.png": "Kinetic and all energy of two discs over time"},
+    ),
 }
 CONTACT = Section(
     "Contact with bodies",

@@ -1,7 +1,6 @@
 """Grains down a rough incline, steady: Bagnold's profile of mu(I), on a slice that is periodic along the slope."""
 
 from dataclasses import replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,13 +9,13 @@ import pytest
 from jax import Array, lax
 
 from benchmarks.validation.blocks import alive, block, box, example, lattice, longest_step
+from benchmarks.validation.periodic import FIRST, Round
 from mpm_env.mpm.materials import MuI
 from mpm_env.mpm.substep import Bed, substep
 from mpm_env.mpm.types import MARGIN, Particles, Wall
 
 ACROSS, HIGH = 4, 24  # periodic cells along the slope, and cells of depth 1
 DX = 1 / HIGH
-FIRST = 2  # cells from the box's wall to the slice
 SLOPE = 0.43  # rad
 GRID = box((ACROSS + 2 * FIRST, HIGH + 6), DX, lower=Wall("stick"), other=Wall("slip"))
 # Depth, gravity and density are 1. Large grains: the profile settles in the time that momentum takes to cross the bed.
@@ -25,26 +24,6 @@ SOLID = {"E": 300.0, "nu": 0.3, "rho": 1.0}  # its own weight strains the bed by
 TOP = 2.06631 / 3  # the closed form at the surface, published for a grain size of 0.04, to which it is inverse
 TIME = 50.0  # sqrt(depth / gravity); what is off falls to a third in about 13
 PROFILE = 0.05  # of the surface velocity, in the mean square; 0.012 observed from half the speed, 0.008 from above
-
-
-class Round:
-    """A slice whose ends are one: nodes that are each other's images move together, grains that leave come back."""
-
-    def __init__(self) -> None:
-        k = MARGIN + FIRST + np.arange(-1, 2)
-        j = np.arange(GRID.shape[1])
-        ends = [np.ravel_multi_index(np.meshgrid(k + n, j, indexing="ij"), GRID.shape).ravel() for n in (0, ACROSS)]
-        self.watched = jnp.asarray(np.concatenate(ends), jnp.int32)
-
-    def nodes(self, carry: Any, v: Array, m: Array) -> tuple[Any, Array]:
-        (v0, v1), (m0, m1) = jnp.split(v, 2), jnp.split(m, 2)
-        total = m0 + m1
-        one = (m0[:, None] * v0 + m1[:, None] * v1) / jnp.where(total > 0, total, 1)[:, None]
-        return carry, jnp.concatenate([one, one]) - v
-
-    def grains(self, carry: Any, p: Particles) -> tuple[Any, Particles]:
-        low = (MARGIN + FIRST) * DX
-        return carry, replace(p, x=p.x.at[0].set(low + jnp.mod(p.x[0] - low, ACROSS * DX)))
 
 
 def bagnold(y: np.ndarray) -> np.ndarray:
@@ -57,7 +36,7 @@ def bagnold(y: np.ndarray) -> np.ndarray:
 @jax.jit
 def flow(material: MuI, p: Particles, dt: Array, steps: Array) -> Particles:
     gravity = jnp.asarray([np.sin(SLOPE), -np.cos(SLOPE)], p.x.dtype)
-    ends = Round()
+    ends = Round(GRID, ACROSS)
 
     def one(_: Array, p: Particles) -> Particles:
         return substep(GRID, (Bed(material, 0, p.count),), p, dt, gravity, ends, None)[0]
