@@ -56,6 +56,13 @@ SECTIONS: dict[str, Section] = {  # part -> what is said of it; the parts run in
         " material by JAX. Errors are of positions, the largest over time of the root mean square over grains.",
         {"vortex.png": "Error of positions over cells; lines of second order"},
     ),
+    "rest": Section(
+        "Sand at rest",
+        "A column between smooth walls, started under its own weight or loaded from nothing by gravity that comes up"
+        " slowly: of sand that its walls hold elastically, and of sand that yields meanwhile. Half a heap of 20 degrees"
+        " of 30 degree sand, left alone. And a collapse in f32 beside the same in f64, grain by grain.",
+        {"column.png": "Stress over depth in a column at rest"},
+    ),
 }
 CONTACT = Section(
     "Contact with bodies",
