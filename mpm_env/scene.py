@@ -182,14 +182,13 @@ def initial(scene: Scene, key: Array, *, qpos: Array | None = None) -> State:
     g = scene.grid
     d = g.dimension
     rows: dict[str, list[Array]] = {"x": [], "v": [], "m": [], "V0": []}
-    origin = jnp.asarray(g.origin, scene.dtype)[:, None]
     for material, fills, (a, b) in zip(scene.materials, scene.fills, scene.spans, strict=True):
         empty = b - a - sum(len(f.sites) for f in fills)
         for fill in fills:
             key, key_fill = jax.random.split(key)
-            x, filled = seeding.scatter(fill, key_fill, scene.dtype)
+            x, filled = seeding.scatter(fill, key_fill, scene.dtype, origin=g.origin)
             n = x.shape[1]
-            rows["x"].append(x - origin)
+            rows["x"].append(x)
             rows["v"].append(jnp.broadcast_to(jnp.asarray(fill.velocity, scene.dtype)[:, None], (d, n)))
             rows["m"].append(jnp.where(filled, material.rho * fill.volume, 0).astype(scene.dtype))
             rows["V0"].append(jnp.full((n,), fill.volume, scene.dtype))

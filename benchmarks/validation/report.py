@@ -34,7 +34,16 @@ class Section(NamedTuple):
 
 
 SECTIONS: dict[str, Section] = {  # part -> what is said of it; the parts run in this order
-    "motion": Section("What motion keeps", "An elastic block turns about its centre, far from any wall."),
+    "motion": Section(
+        "What motion keeps",
+        "An elastic block turns about its centre, far from any wall; a block of sand falls freely; sand flies out of an open box.",
+    ),
+    "symmetry": Section(
+        "Which way, how fast, how far",
+        "A column of sand collapses as it does mirrored, moved by whole cells, or with its axes swapped; a block turns"
+        " as it does in a frame that moves, to rounding in each step, and to what the grid's places change over many; a"
+        " scene 1000 m away is the same to the bit.",
+    ),
     "bars": Section(
         "Bars that ring",
         "A standing wave in a bar that is round on itself, and the first mode of one held by a sticking wall at one end"

@@ -86,14 +86,18 @@ def fill_cylinder(
     return Fill(inside, spacing, math.pi * radius**2 * height / max(len(inside), 1), velocity, None, None)
 
 
-def scatter(fill: Fill, key: Array, dtype: jnp.dtype) -> tuple[Array, Array]:
-    """Jittered positions (d, n) m in the scene's frame, and which sites are filled (n,) bool."""
+def scatter(fill: Fill, key: Array, dtype: jnp.dtype, *, origin: np.ndarray | float = 0.0) -> tuple[Array, Array]:
+    """Jittered positions (d, n) m from the origin (d,) m in the scene's frame, and which sites are filled (n,) bool.
+
+    Sites are taken relative to the origin in f64: a scene a kilometre away starts as the same scene.
+    """
     key_jitter, key_relief = jax.random.split(key)
-    sites = jnp.asarray(fill.sites.T, dtype)
+    sites = jnp.asarray((fill.sites - origin).T, dtype)
     spacing = jnp.asarray(fill.spacing, dtype)[:, None]
     x = sites + spacing * jax.random.uniform(key_jitter, sites.shape, dtype, -JITTER, JITTER)
     if fill.relief is None or fill.top is None:
         return x, jnp.ones(sites.shape[1:], bool)
+    sites = jnp.asarray(fill.sites.T, dtype)
     return x, sites[-1] < fill.top + relief_height(fill.relief, sites[:-1], key_relief)
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks.validation.blocks import GRAVITY, alive, balance, block, box, example, go, lattice, longest_step, update
+from benchmarks.validation.motion import OPEN, PLANES, sand_moving
 from mpm_env.mpm.budgets import mass_that_left, total
 from mpm_env.mpm.materials import MATERIALS, Material
 from mpm_env.mpm.stability import SAFETY
@@ -118,18 +119,7 @@ def test_empty_grid_stays_empty(name: str) -> None:
     np.testing.assert_array_equal(np.asarray(q.v), 0)
 
 
-# Domain exit: a box of 0.6 x 0.4 m, open on the left and right, closed below and above.
-OPEN = box((12, 8), 0.05, lower=Wall("stick"), other=Wall("open"))
-OPEN = replace(OPEN, walls=(OPEN.walls[0], (Wall("stick"), Wall("slip"))))
-PLANES = (MARGIN * OPEN.cell_size, (MARGIN + OPEN.cells[0]) * OPEN.cell_size)
 EXIT_STEPS, ROUNDS = 40, 12
-
-
-def sand_moving(v: tuple[float, float]) -> tuple[Material, Particles]:
-    material = example("sand")
-    spacing = OPEN.cell_size / 2
-    p = block(OPEN, material, lattice((0.1, 0.05), (16, 12), spacing), volume=spacing**2, v=np.array(v))
-    return material, p
 
 
 @pytest.mark.parametrize("speed", [3.0, -3.0])
