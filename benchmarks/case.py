@@ -22,7 +22,7 @@ class Case(NamedTuple):
     band: Band
     value: float
     resolution: str
-    cpu_s: float  # of all runs behind it
+    cpu_s: float  # of all runs behind it; nan where nobody took it
     health: int = 0
     note: str = ""  # where it misses: what is known about why
 
@@ -69,21 +69,21 @@ def say(cases: Iterable[Case]) -> list[dict[str, Any]]:
 
 
 def table_of(cases: Sequence[Mapping[str, Any]]) -> str:
-    """Kept cases; those that differ in the angle of friction alone share a row."""
+    """Kept cases; those that differ in nothing, or in the angle of friction alone, share a row."""
     groups: dict[tuple[str, str, str], list[Mapping[str, Any]]] = {}
     for one in cases:
         name = re.sub(r",? phi [\d.]+", "", one["name"])
         groups.setdefault((name, one["source"], one["resolution"]), []).append(one)
     rows = []
     for (name, source, resolution), some in groups.items():
-        several = f" ({len(some)} angles)" if len(some) > 1 else ""
+        several = f" ({len(some)} runs)" if len(some) > 1 else ""
         bands = list(dict.fromkeys(_band(one) for one in some))
         out = any(one["verdict"] == "misses" for one in some)
         value, reference = (span((one[k] for one in some), _short) for k in ("value", "reference"))
         off = [100 * one["error"] for one in some if one["error"] is not None]
         error = span(off, lambda v: f"{v or 0:+.{0 if abs(v or 0) >= 10 else 1}f} %") if off else "-"
-        seconds = sum(one["cpu_s"] for one in some)
-        cpu = f"{seconds:.{0 if seconds >= 10 else 1}f}"
+        seconds = sum(one["cpu_s"] or 0 for one in some)
+        cpu = f"{seconds:.{0 if seconds >= 10 else 1}f}" if seconds else "-"
         row = [name + several, source, resolution, reference, bands[0] if len(bands) == 1 else "its own"]
         rows.append([*row, marked(value, out), error, cpu])
     return table(["case", "reference", "resolution", "it says", "band", "measured", "off", "CPU s"], rows)
@@ -93,11 +93,12 @@ def missed(cases: Sequence[Mapping[str, Any]]) -> str:
     """How many cases lie in their bands, and a line on those that do not, with what is known about why."""
     wrong = [one for one in cases if one["verdict"] == "misses"]
     text = f"{len(cases) - len(wrong)} of {len(cases)} cases lie in the band of their reference.\n\n"
-    by_note: dict[str, list[Mapping[str, Any]]] = {}
+    notes: dict[str, dict[str, list[float | None]]] = {}  # note -> what was missed -> values
     for one in wrong:
-        by_note.setdefault(one["note"] or "Why is not known", []).append(one)
-    for note, some in by_note.items():
-        told = "; ".join(f"{c['name']} ({c['resolution']}): {_short(c['value'])}, not {_band(c)}" for c in some)
+        told = f"{one['name']} ({one['resolution']}), not {_band(one)}"
+        notes.setdefault(one["note"] or "Why is not known", {}).setdefault(told, []).append(one["value"])
+    for note, values in notes.items():
+        told = "; ".join(f"{name}: {span(some, _short)}" for name, some in values.items())
         text += f"- **Missed**: {told}. {note}.\n"
     return text
 

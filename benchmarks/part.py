@@ -29,9 +29,13 @@ class Band:
         """Whether a number lies in it; one that is not finite is kept as None, and does not."""
         return value is not None and self.low <= value <= self.high
 
+    def asks(self, row: Row) -> bool:
+        """Whether it is for this row."""
+        return self.measure in row and all(row.get(k) == v for k, v in self.where.items())
+
     def misses(self, row: Row, key: str | None = None) -> bool:
         """Whether it is for this row and the row's number, or any of its numbers, lies outside; or the one of a key."""
-        if self.measure not in row or any(row.get(k) != v for k, v in self.where.items()):
+        if not self.asks(row):
             return False
         value = row[self.measure]
         values = [value] if not isinstance(value, Mapping) else value.values() if key is None else [value[key]]

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks.validation.blocks import PARAMETERS, example
+from benchmarks.validation.laws import compression, extension, plane, slope
 from mpm_env import element
 from mpm_env.element import TESTS, Curve
 from mpm_env.mpm.materials.sand import FRICTION_FITS
@@ -17,24 +18,6 @@ RATIO = 1e-6  # of K0; 1e-9 observed
 SAME = 1e-9  # of the pressure: 2-D beside 3-D; 1e-12 observed
 TOLD_APART = 0.3  # degrees: what the project promises, and less than any wrong fit is off
 K0_PHI = (20.0, 30.0, 35.0)  # degrees; with nu = 0.3 the first two rest at nu / (1 - nu) or just above
-
-
-def slope(fit: str, phi: float) -> float:
-    """q/p of the cone in triaxial compression, from what each fit promises of the angle phi in degrees."""
-    sin = np.sin(np.deg2rad(phi))
-    return float({"triaxial": 6 * sin / (3 - sin), "plane_strain": np.sqrt(3) * sin}[fit])
-
-
-def compression(M: float) -> float:
-    return np.rad2deg(np.arcsin(3 * M / (6 + M)))
-
-
-def extension(M: float) -> float:
-    return np.rad2deg(np.arcsin(3 * M / (6 - M)))
-
-
-def plane(M: float) -> float:
-    return np.rad2deg(np.arcsin(M / np.sqrt(3)))
 
 
 CLOSED: dict[str, Callable[[float], float]] = {"triaxial": compression, "biaxial": plane, "shear": plane}

@@ -1,7 +1,6 @@
 """Drucker-Prager sand: published vectors of the return mapping, cohesion, and the laboratory's element tests."""
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +9,7 @@ import pytest
 from jax import Array, lax
 
 from benchmarks.validation.blocks import example, update
+from benchmarks.validation.laws import VECTORS
 from mpm_env.mpm.materials import Material, Sand
 from tests.physics.oracles import rows, sand, tensors
 
@@ -19,42 +19,6 @@ RATIO = 1e-6  # of a stress ratio; 3e-16 (triaxial, K0), 1e-7 (biaxial, which cr
 HELD = 3e-5  # of the confining stress; 6e-6 observed where sand creeps
 CLOSED_FORM = {"float32": 1.5e-6, "float64": 2e-15}  # 3e-7, 2e-16 observed
 CLAY = 1e-5  # the cone of clay has the angle of LEAST_FRICTION: 2e-6 observed
-
-SHEAR = [[1, 0.05, 0], [0, 0.97, 0], [0, 0, 1]]
-
-
-class Vector(NamedTuple):
-    """A trial, and the principal log strains, volume correction and stress (xx, yy, zz, xy) that answer it."""
-
-    F: np.ndarray
-    vc: float
-    H: tuple[float, float, float]  # ascending
-    vc_new: float
-    tau: tuple[float, float, float, float]
-
-
-# E = 353.7 kPa, nu = 0.3, 30 degrees in triaxial compression (K16 section 6.3, volume correction of T17).
-# C3 has its strains along x, y, z; those given are sorted.
-VECTORS = {
-    "elastic": Vector(
-        np.diag([0.99, 0.985, 0.99]), 0, (-0.0151136, -0.0100503, -0.0100503), 0,
-        (-9920.2151912, -11297.8228081, -9920.2151912, 0),
-    ),
-    "tip": Vector(np.diag([1.02, 1, 0.99]), 0, (0, 0, 0), 0.0097522914, (0, 0, 0, 0)),
-    "cone": Vector(
-        np.diag([1.01, 0.95, 1]), 0, (-0.0491986308, -0.0007695217, 0.0086251890), 0,
-        (-6089.6348533, -21822.1618313, -8645.7188207, 0),
-    ),
-    "sheared cone": Vector(
-        np.array(SHEAR), 0, (-0.0358265488, -0.0026355716, 0.0080029129), 0,
-        (-6804.1061061, -13196.9343159, -6932.5137963, 5033.314418),
-    ),
-    "correction consumed": Vector(0.995 * np.eye(3), 0.03, (0, 0, 0), 0.0149623745, (0, 0, 0, 0)),
-    "corrected cone": Vector(
-        np.diag([1, 0.93, 1]), 0.02, (-0.0630848314, 0.0052570693, 0.0052570693), 0,
-        (-9297.1270278, -27891.3810835, -9297.1270278, 0),
-    ),
-}  # fmt: skip
 
 
 def mapped(material: Material, F: np.ndarray, vc: float, d: int, dtype: str) -> tuple[np.ndarray, float, np.ndarray]:

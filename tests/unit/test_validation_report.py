@@ -9,6 +9,7 @@ from benchmarks.case import Case, at_least, at_most, within
 from benchmarks.validation import report
 
 KEPT = report.kept()
+WEIGHT = {"measure": "weight", "low": 0.99, "high": 1.01, "note": "It is known why", "where": {"ratio": 1}}
 
 
 def told(value: float, *, note: str = "", health: int = 0) -> dict:
@@ -43,9 +44,14 @@ def test_a_missed_case_is_marked_in_the_table_and_told_below_it_with_its_note() 
     wrong = [told(2.5, note="It is known why"), told(2.0)]
     assert "| 1.8 to 2.2 | **2 to 2.5** (missed) | +0.0 % to +25 % | 3.0 |" in case.table_of(wrong)
     assert "1 of 2 cases lie" in case.missed(wrong)
-    assert "- **Missed**: a bar: pitch (8 cells): 2.5, not 1.8 to 2.2. It is known why." in case.missed(wrong)
+    assert "- **Missed**: a bar: pitch (8 cells), not 1.8 to 2.2: 2.5. It is known why." in case.missed(wrong)
     assert "Why is not known." in case.missed([told(2.5)])
     assert "**not finite** (missed)" in case.table_of([told(math.nan)])
+
+
+def test_measures_of_contact_that_are_cited_are_those_with_bands() -> None:
+    cited = list(report.contact({"drop": {"rows": [{"weight": 1.1, "ratio": 1}, {"weight": 1.0}], "bands": [WEIGHT]}}))
+    assert [(one["value"], one["verdict"], one["note"]) for one in cited] == [(1.1, "misses", "It is known why")]
 
 
 def test_bounds_of_one_side_are_told_as_such() -> None:
