@@ -13,15 +13,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks import case, job, machine, part
+from benchmarks import case, job, part
 from benchmarks.case import Case, at_most, within
+from benchmarks.validation import PLOTS
 from benchmarks.validation.blocks import GRAVITY, alive, block, box, example, go, lattice, longest_step
 from mpm_env.mpm.materials import Material
 from mpm_env.mpm.materials.protocol import lame
 from mpm_env.mpm.types import MARGIN, Grid, Particles, Wall
 from mpm_env.plot import Series, plot
 
-PLOTS = machine.ROOT / "docs" / "validation"
 HEIGHT = 0.2  # m, of all of them
 RHO = 1500.0  # kg/m^3
 UNIT = float(np.sqrt(HEIGHT / GRAVITY))  # s, in which times are given
@@ -189,7 +189,6 @@ SHOWN = 16  # cells of the column that is plotted
 
 def show(c: Column) -> None:
     """Plot stress over depth."""
-    PLOTS.mkdir(exist_ok=True)
     ends, k0 = np.array([0.0, 1.0]), at_rest_pressure("elastic")
     series = [
         Series("on level planes", c.depth, c.stress[1], colour=0),
