@@ -81,7 +81,7 @@ def table_of(cases: Sequence[Mapping[str, Any]]) -> str:
         out = any(one["verdict"] == "misses" for one in some)
         value, reference = (span((one[k] for one in some), _short) for k in ("value", "reference"))
         off = [100 * one["error"] for one in some if one["error"] is not None]
-        error = span(off, lambda v: f"{v or 0:+.{0 if abs(v or 0) >= 10 else 1}f} %") if off else "-"
+        error = span(off, _percent) if off else "-"
         seconds = sum(one["cpu_s"] or 0 for one in some)
         cpu = f"{seconds:.{0 if seconds >= 10 else 1}f}" if seconds else "-"
         row = [name + several, source, resolution, reference, bands[0] if len(bands) == 1 else "its own"]
@@ -105,6 +105,11 @@ def missed(cases: Sequence[Mapping[str, Any]]) -> str:
 
 def _short(value: float | None) -> str:
     return "not finite" if value is None else f"{value:.3g}"
+
+
+def _percent(value: float | None) -> str:
+    digits = 0 if abs(value or 0) >= 10 else 1
+    return f"{round(value or 0, digits) + 0:+.{digits}f} %"  # + 0: no minus before nothing
 
 
 def _band(one: Mapping[str, Any]) -> str:

@@ -117,10 +117,11 @@ def go(
     gravity: tuple[float, ...] | None = None,
     affine: float = 1.0,
 ) -> Particles:
-    """`advance` with plain numbers: same shapes, same program, whatever the numbers."""
+    """`advance` with plain numbers: same shapes, same program, whatever the numbers. Done when it returns."""
     dtype = p.x.dtype
     g = jnp.asarray(gravity or (0.0,) * grid.dimension, dtype)
-    return advance(grid, material, p, jnp.asarray(dt, dtype), g, jnp.int32(steps), jnp.asarray(affine, dtype))
+    numbers = (jnp.asarray(dt, dtype), g, jnp.int32(steps), jnp.asarray(affine, dtype))
+    return jax.block_until_ready(advance(grid, material, p, *numbers))
 
 
 def balance(grid: Grid, material: Material, p: Particles, gravity: tuple[float, ...] | None = None) -> Budgets:

@@ -111,7 +111,7 @@ def contact(parts: Mapping[str, Row | None]) -> Iterator[dict[str, Any]]:
 def section(told: Section, cases: list[dict[str, Any]]) -> str:
     """A part's text."""
     plots = "".join(f"![{caption}](validation/{name})\n\n{caption}\n\n" for name, caption in told.plots.items())
-    return f"{told.words}\n\n{case.table_of(cases)}\n{case.missed(cases)}\n{plots}"
+    return f"{told.words}\n\n{case.table_of(cases)}\n{case.missed(cases).rstrip()}\n\n{plots}"
 
 
 def render(parts: Mapping[str, Row | None], coupling: Mapping[str, Row | None]) -> str:
