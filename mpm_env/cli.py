@@ -278,6 +278,7 @@ def _add_calibrate(commands: Any) -> None:
     what.add_argument(
         "--column", nargs=3, type=float, metavar=("WIDTH", "HEIGHT", "RUNOUT"), help="m; of sand, in plane strain"
     )
+    what.add_argument("--repose", type=float, metavar="ANGLE", help="degrees at which a bank of sand stays")
     calibrate.add_argument("--test", default="triaxial", metavar="T", help="that measured the curve (default triaxial)")
     calibrate.add_argument("--free", default="friction_deg", metavar="NAMES", help="to find (default friction_deg)")
     _add_loading(calibrate)
@@ -286,15 +287,20 @@ def _add_calibrate(commands: Any) -> None:
 
 
 def _calibrate(options: argparse.Namespace) -> int:
-    return _calibrate_column(options) if options.column else _calibrate_curve(options)
+    return _calibrate_curve(options) if options.curve else _calibrate_friction(options)
 
 
-def _calibrate_column(options: argparse.Namespace) -> int:
+def _calibrate_friction(options: argparse.Namespace) -> int:
     with refusing():
         from mpm_env.calibrate_column import Column, fit_column
+        from mpm_env.calibrate_repose import fit_repose
         from mpm_env.scene_config import read_material
 
-        found = fit_column(read_material(options.material, tuple(options.settings)), Column(*options.column))
+        material = read_material(options.material, tuple(options.settings))
+        if options.column:
+            found = fit_column(material, Column(*options.column))
+        else:
+            found = fit_repose(material, options.repose)
     print(f"friction_deg    {found.friction_deg:.4g} +- {found.scatter_deg:.2g} (seeds of the grains)")
     print(f"finer cells would change it by {found.resolution_deg:+.2g}; {found.runs} runs")
     return 0

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import yaml
 
-from mpm_env import calibrate, calibrate_column, cli, laboratory
+from mpm_env import calibrate, calibrate_column, calibrate_friction, calibrate_repose, cli, laboratory
 from mpm_env.scene_config import read_material
 
 TRUE = {"friction_deg": 31.0, "E": 8e5}  # dry_sand starts from 35 degrees and 1 MPa
@@ -87,31 +87,44 @@ def test_unknown_parameter_is_refused_with_the_known_ones(tmp_path: Path) -> Non
         found(write(tmp_path / "curve.csv"), "friction")
 
 
+REPOSE = 5.0  # degrees of friction, two of repose
 WALL = calibrate_column.Column(0.1, 0.1, 0.23)  # m
 
 
 def test_friction_is_found_again_from_the_runout_of_a_column() -> None:
     """From that of a column of other grains: within what seeds are said to scatter."""
     sand = read_material("dry_sand")
-    runs = calibrate_column.Runs(sand, WALL, calibrate_column.ACROSS[0])
-    far, near = (runs.front(angle, 7) for angle in (28.0, 38.0))
+    slice = WALL.slice(sand, calibrate_friction.ACROSS[0])
+    far, near = (calibrate_column.front(slice, angle, 7) for angle in (28.0, 38.0))
     assert far > near + 0.02
     found = calibrate_column.fit_column(sand, WALL._replace(runout=far))
     assert 0 < found.scatter_deg < 1 and abs(found.resolution_deg) < 5
-    assert found.friction_deg == pytest.approx(28, abs=WITHIN * found.scatter_deg + calibrate_column.CLOSE)
+    assert found.friction_deg == pytest.approx(28, abs=WITHIN * found.scatter_deg + calibrate_friction.CLOSE)
 
 
-COLUMNS_REFUSED = {
-    ("dry_sand", "0.1", "0.1", "0.05"): "a runout beyond its width",
-    ("dry_sand", "0.1", "0.1", "0.9"): "No friction from 12 to 50 degrees lets this column run to 0.9 m",
-    ("snow_packed", "0.1", "0.1", "0.2"): "tells the friction_deg of sand, and snow has none",
+@pytest.mark.slow
+def test_friction_is_found_again_from_the_angle_of_repose() -> None:
+    """27.5 degrees of repose are those of about 33 degrees of friction, since tan(repose) = sin(phi) (Davis 1968)."""
+    found = calibrate_repose.fit_repose(read_material("dry_sand"), 27.5)
+    assert 0 < found.scatter_deg < 1.5 and abs(found.resolution_deg) < 5
+    law = np.degrees(np.arcsin(np.tan(np.radians(27.5))))
+    assert found.friction_deg == pytest.approx(law, abs=REPOSE)
+    assert found.friction_deg > 27.5 + REPOSE / 2, "the angle of repose taken for that of friction"
+
+
+UNMEASURED = {
+    ("dry_sand", "--column", "0.1", "0.1", "0.05"): "a runout beyond its width",
+    ("dry_sand", "--column", "0.1", "0.1", "0.9"): "No friction from 12 to 50 degrees lets this column run to 0.9 m",
+    ("snow_packed", "--column", "0.1", "0.1", "0.2"): "tells the friction_deg of sand, and snow has none",
+    ("snow_packed", "--repose", "30"): "tells the friction_deg of sand, and snow has none",
+    ("dry_sand", "--repose", "60"): "No friction from 10 to 65 degrees has this sand stand at 60 degrees",
 }
 
 
-@pytest.mark.parametrize("given", COLUMNS_REFUSED, ids=" ".join)
-def test_senseless_column_is_refused_in_one_line(given: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("given", UNMEASURED, ids=" ".join)
+def test_senseless_measurement_is_refused(given: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as end:
-        cli.main(["calibrate", given[0], "--column", *given[1:]])
+        cli.main(["calibrate", *given])
     said = capsys.readouterr()
     assert end.value.code == cli.REFUSED and said.out == ""
-    assert said.err.startswith("mpm-env: ") and said.err.count("\n") == 1 and COLUMNS_REFUSED[given] in said.err
+    assert said.err.startswith("mpm-env: ") and said.err.count("\n") == 1 and UNMEASURED[given] in said.err
