@@ -47,7 +47,7 @@ class Bed:
     friction: float = 0.5  # of bodies
     gravity: float = G
     rigid_dt: float = 0.004
-    material: dict[str, Any] = field(default_factory=dict)  # what differs from SAND
+    material: dict[str, Any] = field(default_factory=dict)  # a whole one, or what differs from SAND
     fidelity: dict[str, Any] = field(default_factory=dict)  # what differs from the default
     bodies: dict[str, Any] = field(default_factory=dict)  # more of BodiesConfig
     lower: Vec = (0.0, 0.0, 0.0)  # corner of the box
@@ -68,7 +68,7 @@ class Bed:
             "walls": self.walls,
             "grains": [
                 {
-                    "material": SAND | self.material,
+                    "material": self.material if "model" in self.material else SAND | self.material,
                     "fill": [{"shape": "box", "lower": low, "upper": high} for low, high in self.fills],
                 }
             ],

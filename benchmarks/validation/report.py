@@ -79,6 +79,44 @@ SECTIONS: dict[str, Section] = {  # part -> what is said of it; the parts run in
         " of 30 degree sand, left alone. And a collapse in f32 beside the same in f64, grain by grain.",
         {"column.png": "Stress over depth in a column at rest"},
     ),
+    "columns": Section(
+        "Columns and banks",
+        "Columns on a floor that grains stick to, in plane strain against discs by contact dynamics, and quarters of"
+        " cylinders against experiments. The sand has one friction, tan(phi) = 0.36 in plane strain, chosen to run as"
+        " the discs do; it is not their angle of repose. Heights are mass over density. A bank is what stays where"
+        " one side of a bed is opened, and what falls is gone.",
+        {
+            "columns_0.5.png": "A wide column at rest, and discs",
+            "columns_6.26.png": "A tall one",
+            "columns_scaling.png": "Runout over the aspect ratio",
+        },
+    ),
+    "footing": Section(
+        "A strip footing",
+        "A rough footing pressed slowly into clay without weight (von Mises without hardening, whose shear strength in"
+        " plane strain is the yield stress over sqrt(3)) and into sand. The load is the mean over the second cell of"
+        " travel: under a face that passes planes of nodes it has their period. Limit loads of sand are for associated"
+        " flow; without dilation they are lower.",
+        {"footing.png": "Pressure over travel"},
+    ),
+    "silo": Section(
+        "A silo",
+        "Grains out of a slot in plane strain, of mu(I) with the numbers of the reference and of one friction.",
+        {"silo.png": "Flow over the width of the slot"},
+    ),
+    "stir": Section(
+        "A bed that is stirred",
+        "A paddle goes into a level bed, sweeps to and fro and comes out. The volume is read off the mean heights of"
+        " columns, so a level or an uneven bed counts the same.",
+        {"stir.png": "Volume over the cycles of the paddle"},
+    ),
+    "snow": Section(
+        "Snow",
+        "Snow confined between smooth walls under gravity that grows to 38 g, against the closed form of confined"
+        " compression. Balls of 8 cm thrown on a floor stick and keep their shape at 1 m/s, break at 3 m/s, and are"
+        " crushed where the blow, rho v^2, is more than packed snow bears.",
+        {"snow.png": "Weight of the snow above a layer over the layer's volume"},
+    ),
 }
 CONTACT = Section(
     "Contact with bodies",
