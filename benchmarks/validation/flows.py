@@ -13,7 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from benchmarks import machine
 from benchmarks.coupling import beds
 from benchmarks.coupling.beds import RHO, G
 from mpm_env import Fidelity, Scene, SceneConfig, State, build, initial
@@ -21,7 +20,6 @@ from mpm_env.config import parse
 from mpm_env.sim import rigid_step
 
 STICK = {"z_lower": {"kind": "stick"}}
-PLOTS = machine.ROOT / "docs" / "validation"
 SOFT = 0.015  # rho g H / E: the weight of a bed strains it by a per cent, and a column runs as if it were rigid
 
 
@@ -82,7 +80,7 @@ def _walk(scene: Scene, state: State, steps: Array, weight: Array, affine: Array
     def one(k: Array, state: State) -> State:
         share = weight[0] + (weight[1] - weight[0]) * k / steps
         heavy = replace(scene, gravity=share * gravity)
-        state = rigid_step(heavy, state, None)  # type: ignore[arg-type]  # no bodies, nothing to drive
+        state = rigid_step(heavy, state, None)  # no bodies, nothing to drive
         return replace(state, grains=replace(state.grains, C=state.grains.C * affine))
 
     return jax.lax.fori_loop(0, steps, one, state)

@@ -15,7 +15,7 @@ from benchmarks import case, job, part
 from benchmarks.case import Case, within
 from benchmarks.coupling.beds import RHO, G, at_rest, sand
 from benchmarks.coupling.scenes import Bed, about, planted, ride, soft_travel
-from benchmarks.validation.flows import PLOTS
+from benchmarks.validation import PLOTS
 from mpm_env.plot import Series, plot
 
 CELL = 0.025  # m

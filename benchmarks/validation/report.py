@@ -82,9 +82,10 @@ SECTIONS: dict[str, Section] = {  # part -> what is said of it; the parts run in
     "columns": Section(
         "Columns and banks",
         "Columns on a floor that grains stick to, in plane strain against discs by contact dynamics, and quarters of"
-        " cylinders against experiments. The sand has one friction, tan(phi) = 0.36 in plane strain, chosen to run as"
-        " the discs do; it is not their angle of repose. Heights are mass over density. A bank is what stays where"
-        " one side of a bed is opened, and what falls is gone.",
+        " cylinders against experiments. Sand of one friction has tan(phi) = 0.36 in plane strain, chosen to run as the"
+        " discs do, or 30 degrees as triaxial tests have it; mu(I) has the numbers that the discs' authors gave it."
+        " Heights are mass over density. A bank is what stays where one side of a bed is opened, and what falls is"
+        " gone; its band around Davis's angle was set with the first banks known.",
         {
             "columns_0.5.png": "A wide column at rest, and discs",
             "columns_6.26.png": "A tall one",
@@ -113,8 +114,10 @@ SECTIONS: dict[str, Section] = {  # part -> what is said of it; the parts run in
     "snow": Section(
         "Snow",
         "Snow confined between smooth walls under gravity that grows to 38 g, against the closed form of confined"
-        " compression. Balls of 8 cm thrown on a floor stick and keep their shape at 1 m/s, break at 3 m/s, and are"
-        " crushed where the blow, rho v^2, is more than packed snow bears.",
+        " compression. Balls of 8 cm, in plane strain, are thrown on a floor: at 20 cells they stick and keep their"
+        " shape at 1 m/s, break at 3 m/s, and are crushed where the blow, rho v^2, exceeds what packed snow bears."
+        " Size, speeds and bands of the balls were chosen with the first of them known, to show both ends; a ball of 20"
+        " cm and 40 cells crumbles when dropped.",
         {"snow.png": "Weight of the snow above a layer over the layer's volume"},
     ),
 }

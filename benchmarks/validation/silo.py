@@ -19,7 +19,8 @@ from benchmarks.case import Case, at_most, within
 from benchmarks.coupling.beds import RHO, G, sand
 from benchmarks.coupling.fits import exponent
 from benchmarks.coupling.scenes import Bed, about, planted, run
-from benchmarks.validation.flows import PLOTS, Clock, mass
+from benchmarks.validation import PLOTS
+from benchmarks.validation.flows import Clock, mass
 from mpm_env import scripted
 from mpm_env.plot import Series, plot
 
@@ -108,10 +109,7 @@ def drain(friction: str, slot: float, *, half: int = HALF, high: int = HIGH) -> 
 SLOTS = (4.5, 6.5, 8.5, 10.5)  # cells, half a slot; its edge lies between nodes
 STARON = "Staron et al. 2012, mu(I)"
 REFERENCE = 1.435  # C of a slot in plane strain, both for mu(I) and for discs
-EDGE = (
-    "Beside the edge of a slot grains pass about a cell more slowly, which takes more from a narrow slot and raises the"
-    " power"
-)
+NARROW = "Of the narrowest slots: from 13 to 21 cells the power is 1.6, from 9 to 13 it is 1.8"
 
 
 def measure(quick: bool) -> dict[str, Any]:
@@ -123,7 +121,7 @@ def measure(quick: bool) -> dict[str, Any]:
         done = [drain(friction, slot) for slot in slots]
         wide, flows = np.array([d.width for d in done]), np.array([d.early for d in done])
         cpu_s, health = sum(d.cpu_s for d in done), int(np.bitwise_or.reduce([d.health for d in done]))
-        kept = (f"slots of {2 * slots[0]:g} to {2 * slots[-1]:g} cells", cpu_s, health, EDGE)
+        kept = (f"slots of {2 * slots[0]:g} to {2 * slots[-1]:g} cells", cpu_s, health, NARROW)
         half_full = max((d.late / d.early for d in done), key=lambda r: abs(r - 1))
         lost = max(d.missing for d in done)
         cases += [

@@ -17,7 +17,8 @@ from benchmarks import case, job, part
 from benchmarks.case import Case, at_least, within
 from benchmarks.coupling.beds import at_rest
 from benchmarks.coupling.scenes import Bed, about, planted, ride
-from benchmarks.validation.flows import PLOTS, STICK, places, sand
+from benchmarks.validation import PLOTS
+from benchmarks.validation.flows import STICK, places, sand
 from mpm_env import Scene, State
 from mpm_env.plot import Series, plot
 
@@ -96,13 +97,15 @@ def stir(cycles: int, *, volume_correction: bool = True, push_out: bool = False)
 
 KEPT = "flow keeps the volume"
 DENSER = (
-    "The correction closes more than opened: what loose grains strain in flight is no gap. Without a paddle, the same"
-    " bed that sloshes to and fro as gravity tilts by 40 degrees loses 3 % in 20 cycles with it, and nothing without"
+    "The correction closes more than opened, perhaps since what loose grains strain in flight is no gap. Without a"
+    " paddle, the same bed that sloshes to and fro as gravity tilts by 40 degrees loses 3 % in 20 cycles with it, and"
+    " nothing without"
 )
 PUSHED = (
     "Grains inside a body are put back to its surface one by one, between others, and no strain tells of it: what a"
     " tool presses on becomes denser than any stress made it, here by 2 % of the bed with each cycle, and hardly less"
-    " with half the cell or half the rigid step. Where the grid alone stops grains (push_out: false) it does not"
+    " with a paddle twice as thick or half the rigid step. Where the grid alone stops grains (push_out: false) it does"
+    " not"
 )
 
 

@@ -27,7 +27,7 @@ def holds(value: float, band: tuple[float, float]) -> bool:
 
 def test_a_wide_column_comes_to_lie_as_discs_do() -> None:
     there = columns.DISCS[0.5]
-    heap, viscous = (columns.collapse(2.0, 16, columns.DISC_DEG, times=6, pic=pic) for pic in (False, True))
+    heap, viscous = (columns.collapse(2.0, 16, columns.SLIPPERY, times=6, pic=pic) for pic in (False, True))
     assert heap.health == 0
     assert heap.off(there) < PROFILE < viscous.off(there), (heap.off(there), viscous.off(there))
     assert holds(heap.fronts[-1], within(there.fronts[-1], FRONT)), heap.fronts

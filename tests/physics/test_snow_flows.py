@@ -20,6 +20,7 @@ def test_snow_packs_as_the_closed_form_says_and_never_swells_as_weight_grows() -
 
 @pytest.mark.slow
 def test_a_snowball_sticks_when_dropped_breaks_when_thrown_and_comes_to_rest() -> None:
+    """At 20 cells across; with more cells it breaks at lower speeds."""
     dropped, thrown, hurled = (snow.throw(v) for v in (1.0, 3.0, 30.0))
     for b in (dropped, thrown, hurled):
         assert b.health == 0
