@@ -341,7 +341,6 @@ def banks(quick: bool) -> list[Case]:
 def measure(quick: bool) -> dict[str, Any]:
     """All cases."""
     job.pin(1)
-    PLOTS.mkdir(parents=True, exist_ok=True)
     return {"cases": case.say([*discs(quick), *laws(quick), *slopes(quick), *banks(quick)])}
 
 

@@ -103,7 +103,6 @@ def dry(half: float = HALF, friction_fit: str = "plane_strain") -> Press:
 def measure(quick: bool) -> dict[str, Any]:
     """Both materials."""
     job.pin(1)
-    PLOTS.mkdir(parents=True, exist_ok=True)
     half = 4.5 if quick else HALF
     soft, hard, told = clay(half), dry(half), f"{2 * half:g} cells wide"
     plot(

@@ -115,7 +115,6 @@ NARROW = "Of the narrowest slots: from 13 to 21 cells the power is 1.6, from 9 t
 def measure(quick: bool) -> dict[str, Any]:
     """Slots of both materials."""
     job.pin(1)
-    PLOTS.mkdir(parents=True, exist_ok=True)
     slots, series, cases = SLOTS[::3] if quick else SLOTS, [], []
     for friction, told in {"mu_i": "mu(I)", "dry": "friction of 25 degrees"}.items():
         done = [drain(friction, slot) for slot in slots]

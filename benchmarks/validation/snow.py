@@ -202,7 +202,6 @@ def thrown(quick: bool) -> list[Case]:
 def measure(quick: bool) -> dict[str, Any]:
     """All cases."""
     job.pin(1)
-    PLOTS.mkdir(parents=True, exist_ok=True)
     return {"cases": case.say([*packed(quick), *thrown(quick)])}
 
 

@@ -112,7 +112,6 @@ PUSHED = (
 def measure(quick: bool) -> dict[str, Any]:
     """Beds whose paddle stops grains by the grid, without the correction too, which is to swell, or pushes them out."""
     job.pin(1)
-    PLOTS.mkdir(parents=True, exist_ok=True)
     cycles = (5,) if quick else (5, 10, 20)
     cases, series = [], []
     for told, band, note, how in (
