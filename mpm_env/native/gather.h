@@ -8,26 +8,26 @@ namespace MPM_ISA {
 
 struct NoLaw {};
 
-// Strain sixteen grains by their velocity gradient, and ask the law. Rows of the arrays are n apart. Not inlined: the
+// Strain grains, as many as the law takes at once, by their velocity gradient, and ask the law. Rows of the arrays are n apart. Not inlined: the
 // law needs every register.
 template <class S, int D, class L>
 __attribute__((noinline)) void answer(const L& law, S dt, const S* C, S* e, S* tau, S* history, int64_t n) {
   Sym<S, D> old, stress;
-  Pack<S> G[D][D], M[D][D];  // dt grad v, and G b: b_trial - I = e + M + M^T + M G^T
-  for (int k = 0; k < Sym<S, D>::count; ++k) old.c[k] = Pack<S>::load(e + k * n);
+  Lane<S> G[D][D], M[D][D];  // dt grad v, and G b: b_trial - I = e + M + M^T + M G^T
+  for (int k = 0; k < Sym<S, D>::count; ++k) old.c[k] = Lane<S>::load(e + k * n);
   for (int i = 0; i < D; ++i)
-    for (int j = 0; j < D; ++j) G[i][j] = dt * Pack<S>::load(C + (i * D + j) * n);
+    for (int j = 0; j < D; ++j) G[i][j] = dt * Lane<S>::load(C + (i * D + j) * n);
   for (int i = 0; i < D; ++i)
     for (int j = 0; j < D; ++j) {
       M[i][j] = G[i][j];
       for (int k = 0; k < D; ++k) M[i][j] = M[i][j] + G[i][k] * old.at(k, j);
     }
   Sym<S, D> trial = symmetric<S, D>(old.c[2], [&](int i, int j) {
-    Pack<S> sum = old.at(i, j) + M[i][j] + M[j][i];
+    Lane<S> sum = old.at(i, j) + M[i][j] + M[j][i];
     for (int k = 0; k < D; ++k) sum = sum + M[i][k] * G[j][k];
     return sum;
   });
-  Pack<S> memory = history ? Pack<S>::load(history) : Pack<S>(S(0));
+  Lane<S> memory = history ? Lane<S>::load(history) : Lane<S>(S(0));
   law(trial, stress, memory);
   for (int k = 0; k < Sym<S, D>::count; ++k) { trial.c[k].store(e + k * n); stress.c[k].store(tau + k * n); }
   if (history) memory.store(history);
@@ -105,7 +105,9 @@ template <class S, int D, class L> void gather(const ToGrains& t, int64_t b, int
       vi.store(v + i * n + p);
       (Pack<S>::load(x + i * n + p) + dt * vi).store(x + i * n + p);
     }
-    if constexpr (strains) answer<S, D>(law, dt, C + p, e + p, tau + p, t.memory ? history + p : nullptr, n);
+    if constexpr (strains)
+      for (int64_t q = p; q < p + W; q += LANES<S>)
+        answer<S, D>(law, dt, C + q, e + q, tau + q, t.memory ? history + q : nullptr, n);
   }
 }
 

@@ -78,7 +78,7 @@ template <class S, int D> struct Scatter {
   // The planes [from, to) of nodes: cleared where grains reach, filled, and made velocities.
   void planes(int64_t from, int64_t to) const {
     columns(from, to, [&](int64_t, int64_t, S* q, int64_t count) { std::fill(q, q + 4 * count, S(0)); });
-    fill(from, to);
+    fill(from, to, std::make_integer_sequence<int, W / LANES<S>>());
     columns(from, to, [&](int64_t i, int64_t low, S* q, int64_t count) { velocities(i, low, q, count); });
   }
 
@@ -103,95 +103,131 @@ template <class S, int D> struct Scatter {
 
   // One record per grain, four numbers each: momentum and mass, and how momentum grows by one cell along each axis.
   INLINE void records(int64_t p, S* record) const {
+    constexpr int L = LANES<S>;
     const int64_t n = t.grains;
     const S cell = S(t.grid.cell_size), push = dt * S(4 / (t.grid.cell_size * t.grid.cell_size));
-    Pack<S> out[16], mass = Pack<S>::load(m + p), force = push * Pack<S>::load(V0 + p);
-    Sym<S, D> stress;
-    for (int k = 0; k < STRESSES; ++k) stress.c[k] = Pack<S>::load(tau + k * n + p);
-    for (auto& a : out) a = Pack<S>(S(0));
-    out[3] = mass;
-    for (int i = 0; i < D; ++i) {
-      out[i] = mass * Pack<S>::load(v + i * n + p);
-      for (int j = 0; j < D; ++j)
-        out[4 + 4 * j + i] = cell * (mass * Pack<S>::load(C + (i * D + j) * n + p) - force * stress.at(i, j));
+    for (int64_t q = p; q < p + W; q += L, record += W * L) {
+      Pack<S, L> out[16], mass = Pack<S, L>::load(m + q), force = push * Pack<S, L>::load(V0 + q);
+      Sym<S, D> stress;
+#pragma GCC unroll 6
+      for (int k = 0; k < STRESSES; ++k) stress.c[k] = Pack<S, L>::load(tau + k * n + q);
+#pragma GCC unroll 16
+      for (int k = 0; k < 16; ++k) out[k] = Pack<S, L>(S(0));
+      out[3] = mass;
+#pragma GCC unroll 3
+      for (int i = 0; i < D; ++i) {
+        out[i] = mass * Pack<S, L>::load(v + i * n + q);
+#pragma GCC unroll 3
+        for (int j = 0; j < D; ++j)
+          out[4 + 4 * j + i] = cell * (mass * Pack<S, L>::load(C + (i * D + j) * n + q) - force * stress.at(i, j));
+      }
+#pragma GCC unroll 8
+      for (int k = 0; k < 16; k += L) {
+        transpose_block<S>(out + k);
+#pragma GCC unroll 16
+        for (int l = 0; l < L; ++l) out[k + l].store(record + W * l + k);
+      }
     }
-    transpose(out);
-    for (int l = 0; l < W; ++l) out[l].store(record + W * l);
   }
 
-  void fill(int64_t from, int64_t to) const {
-    const int64_t plane = g.node[0];
-    const Row<S> row;
-    Window<S> win;
-    alignas(64) S record[W * W];
-    Pack<S> sum[ROWS];
-    for (auto& a : sum) a = Pack<S>(S(0));
-    int32_t now = EMPTY;
-    int i0 = 0, i1 = 0;  // which of the window's planes are ours
-    auto flush = [&] {
+  // What successive grains of one cell add to its window: of every row of four nodes, the lanes of one register, so that
+  // all rows together fit into the machine's.
+  struct Sums {
+    static constexpr int L = LANES<S>;
+    const Scatter& of;
+    const int64_t from, to, plane;
+    const int part;
+    const Row<S, L> row;
+    Pack<S, L> sum[ROWS];
+    int32_t before = EMPTY, now = EMPTY;  // the cell of the slot before, ours or not, and the one summed for, if any
+    int i0 = 0, i1 = 0;                   // which of the window's planes are ours
+
+    Sums(const Scatter& of, int64_t from, int64_t to, int part)
+        : of(of), from(from), to(to), plane(of.g.node[0]), part(part), row(part) {
+      for (auto& a : sum) a = Pack<S, L>(S(0));
+    }
+
+    void flush() { flush(sum); }
+
+    INLINE void flush(Pack<S, L>* sum) {
       if (now == EMPTY) return;
-      S* q = nodes + 4 * int64_t(now);
+      S* q = of.nodes + 4 * int64_t(now) + part * L;
       constexpr int per = ROWS / 3;
 #pragma GCC unroll 3
       for (int i = 0; i < 3; ++i)
         if (i >= i0 && i < i1)
 #pragma GCC unroll 3
           for (int j = 0; j < per; ++j) {
-            S* r = q + 4 * (i * plane + j * (D == 3 ? g.node[1] : 0));
-            (Pack<S>::load(r) + sum[i * per + j]).store(r);
+            S* r = q + 4 * (i * plane + j * (D == 3 ? of.g.node[1] : 0));
+            (Pack<S, L>::load(r) + sum[i * per + j]).store(r);
           }
-      for (auto& a : sum) a = Pack<S>(S(0));
+#pragma GCC unroll 9
+      for (int r = 0; r < ROWS; ++r) sum[r] = Pack<S, L>(S(0));
       now = EMPTY;
-    };
-    int32_t before = EMPTY;  // the cell of the slot before, ours or not: sums are cut there whoever works
-    for (int64_t block = 0; block * BLOCK < t.grains; ++block) {
-      if (plan.last[block] < from - 2 || plan.first[block] >= to) { flush(); before = EMPTY; continue; }
-      for (int64_t p = block * BLOCK; p < std::min((block + 1) * BLOCK, t.grains); p += W) {
-        if (std::all_of(&plan.cell[p], &plan.cell[p] + W, [](int32_t c) { return c == EMPTY; })) {
-          flush();
-          before = EMPTY;
-          continue;
-        }
-        records(p, record);
-        look<S, D>(x + p, t.grains, S(1 / t.grid.cell_size), g, win);
-        for (int l = 0; l < W; ++l) {
-          const int32_t c = plan.cell[p + l];
-          if (c != before) {
-            flush();
-            before = now = c;
-            if (c != EMPTY) {
-              const int64_t i = c / plane;
-              i0 = int(std::max<int64_t>(from - i, 0));
-              i1 = int(std::min<int64_t>(to - i, 3));
-              if (i0 >= i1) now = EMPTY;
-            }
+    }
+
+    void skip() { flush(); before = EMPTY; }
+
+    // Sixteen grains. Sums are cut where the cell changes, whoever works.
+    void add(const int32_t* cell, const S* record, const Window<S>& win) {
+      Pack<S, L> sum[ROWS];  // these stay in registers
+#pragma GCC unroll 9
+      for (int r = 0; r < ROWS; ++r) sum[r] = this->sum[r];
+      for (int l = 0; l < W; ++l) {
+        const int32_t c = cell[l];
+        if (c != before) {
+          flush(sum);
+          before = now = c;
+          if (c != EMPTY) {
+            const int64_t i = c / plane;
+            i0 = int(std::max<int64_t>(from - i, 0));
+            i1 = int(std::min<int64_t>(to - i, 3));
+            if (i0 >= i1) now = EMPTY;
           }
-          if (now == EMPTY) continue;
-          const S* q = record + W * l;
-          Pack<S> f(win.f[D - 1][l]), w = row.weight(f), M = repeated(q), X = repeated(q + 4);
-          if constexpr (D == 2) {
-            Pack<S> Z = repeated(q + 8), T = w * (M + Z * (row.node - f) - X * win.f[0][l]);
-            X = w * X;
-            sum[0] = sum[0] + T * win.w[0][0][l]; T = T + X;
-            sum[1] = sum[1] + T * win.w[0][1][l]; T = T + X;
-            sum[2] = sum[2] + T * win.w[0][2][l];
-          } else {
-            Pack<S> Y = repeated(q + 8), Z = repeated(q + 12);
-            Pack<S> T = w * (M + Z * (row.node - f) - X * win.f[0][l] - Y * win.f[1][l]);
-            X = w * X; Y = w * Y;
+        }
+        if (now == EMPTY) continue;
+        const S* q = record + W * l;
+        Pack<S, L> f(win.f[D - 1][l]), w = row.weight(f), M = repeated(q, part), X = repeated(q + 4, part);
+        if constexpr (D == 2) {
+          Pack<S, L> Z = repeated(q + 8, part), T = w * (M + Z * (row.node - f) - X * win.f[0][l]);
+          X = w * X;
+          sum[0] = sum[0] + T * win.w[0][0][l]; T = T + X;
+          sum[1] = sum[1] + T * win.w[0][1][l]; T = T + X;
+          sum[2] = sum[2] + T * win.w[0][2][l];
+        } else {
+          Pack<S, L> Y = repeated(q + 8, part), Z = repeated(q + 12, part);
+          Pack<S, L> T = w * (M + Z * (row.node - f) - X * win.f[0][l] - Y * win.f[1][l]);
+          X = w * X; Y = w * Y;
 #pragma GCC unroll 3
-            for (int j = 0; j < 3; ++j) {
-              Pack<S> wy(win.w[1][j][l]), U = wy * T, UX = wy * X;
-              sum[j] = sum[j] + U * win.w[0][0][l]; U = U + UX;
-              sum[3 + j] = sum[3 + j] + U * win.w[0][1][l]; U = U + UX;
-              sum[6 + j] = sum[6 + j] + U * win.w[0][2][l];
-              T = T + Y;
-            }
+          for (int j = 0; j < 3; ++j) {
+            Pack<S, L> wy(win.w[1][j][l]), U = wy * T, UX = wy * X;
+            sum[j] = sum[j] + U * win.w[0][0][l]; U = U + UX;
+            sum[3 + j] = sum[3 + j] + U * win.w[0][1][l]; U = U + UX;
+            sum[6 + j] = sum[6 + j] + U * win.w[0][2][l];
+            T = T + Y;
           }
         }
       }
+#pragma GCC unroll 9
+      for (int r = 0; r < ROWS; ++r) this->sum[r] = sum[r];
     }
-    flush();
+  };
+
+  template <int... PART> void fill(int64_t from, int64_t to, std::integer_sequence<int, PART...>) const {
+    Window<S> win;
+    alignas(64) S record[W * W];
+    Sums sums[] = {Sums(*this, from, to, PART)...};
+    for (int64_t block = 0; block * BLOCK < t.grains; ++block) {
+      if (plan.last[block] < from - 2 || plan.first[block] >= to) { for (auto& s : sums) s.skip(); continue; }
+      for (int64_t p = block * BLOCK; p < std::min((block + 1) * BLOCK, t.grains); p += W) {
+        const int32_t* cell = &plan.cell[p];
+        if (std::all_of(cell, cell + W, [](int32_t c) { return c == EMPTY; })) { for (auto& s : sums) s.skip(); continue; }
+        records(p, record);
+        look<S, D>(x + p, t.grains, S(1 / t.grid.cell_size), g, win);
+        for (auto& s : sums) s.add(cell, record, win);
+      }
+    }
+    for (auto& s : sums) s.flush();
   }
 
   // Momenta become velocities: forces have acted, gravity acts, walls answer. As substep.node_velocities and walls.

@@ -65,19 +65,21 @@ template <class S, int D> INLINE void look(const S* x, int64_t n, S per_cell, co
   }
 }
 
-// Along the last axis: each lane's node (0 0 0 0 1 1 1 1 ..) and that node's weight for a grain at f.
-template <class S> struct Row {
-  Pack<S> node, a, b, c;
-  Row() {
+// Along the last axis: each lane's node (0 0 0 0 1 1 1 1 ..) and that node's weight for a grain at f; of a whole pack, or
+// of the lanes that one of its parts has.
+template <class S, int L = W> struct Row {
+  Pack<S, L> node, a, b, c;
+  explicit Row(int part = 0) {
     constexpr double poly[4][3] = {{1.125, -1.5, 0.5}, {-0.25, 2, -1}, {0.125, -0.5, 0.5}, {0, 0, 0}};
-    S v[4][W];
-    for (int l = 0; l < W; ++l) {
-      v[0][l] = S(l / 4);
-      for (int k = 0; k < 3; ++k) v[k + 1][l] = S(poly[l / 4][k]);
+    S v[4][L];
+    for (int l = 0; l < L; ++l) {
+      const int i = (part * L + l) / 4;
+      v[0][l] = S(i);
+      for (int k = 0; k < 3; ++k) v[k + 1][l] = S(poly[i][k]);
     }
-    node = Pack<S>::load(v[0]); a = Pack<S>::load(v[1]); b = Pack<S>::load(v[2]); c = Pack<S>::load(v[3]);
+    node = Pack<S, L>::load(v[0]); a = Pack<S, L>::load(v[1]); b = Pack<S, L>::load(v[2]); c = Pack<S, L>::load(v[3]);
   }
-  INLINE Pack<S> weight(Pack<S> f) const { return (c * f + b) * f + a; }
+  INLINE Pack<S, L> weight(Pack<S, L> f) const { return (c * f + b) * f + a; }
 };
 
 }  // namespace MPM_ISA
