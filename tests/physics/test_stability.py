@@ -45,7 +45,7 @@ def growth(sites: np.ndarray, nu: float, courant: float, *, C: float = 0.0, v: f
 
     def motion(p: Particles) -> float:
         parts = (p.v, p.C * dx, c * p.e)
-        return max(float(np.abs(np.asarray(a)[..., alive(p)]).max()) for a in parts)
+        return float(np.max([np.abs(np.asarray(a)[..., alive(p)]).max() for a in parts]))  # a NaN stays one
 
     first, most = motion(p), 0.0
     for _ in range(5):
