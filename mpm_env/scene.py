@@ -22,6 +22,7 @@ from mpm_env.health import MOST_TRAVEL, ContactReport
 from mpm_env.motion import Motion
 from mpm_env.mpm import seeding
 from mpm_env.mpm.materials import Material
+from mpm_env.mpm.settling import at_rest, slowest_period
 from mpm_env.mpm.stability import courant_limit, largest_dt
 from mpm_env.mpm.substep import Bed
 from mpm_env.mpm.transfer import CHUNK
@@ -53,6 +54,7 @@ class Scene:
     adhesion: tuple[float, ...]  # Pa, of each material to the bodies
     motion: Motion
     sizes: Sizes
+    settling: float | None  # s, period of the bed's slowest wave; None where grains start unstrained
     middle: float  # m, the slice's y in plane strain
     dtype: Any
     kernels: str  # "native" or "xla"
@@ -169,6 +171,7 @@ def build(config: SceneConfig, fidelity: Fidelity) -> Scene:
         motion=motion,
         adhesion=per_grains("adhesion", config.bodies.adhesion, len(config.grains)) if config.bodies else (),
         sizes=sizes_of(bodies, grid, config, fidelity, at, middle) if bodies else Sizes(0, 0),
+        settling=_settling(config, grid, materials, fills),
         middle=middle,
         dtype=dtype,
         kernels=native.chosen(fidelity.kernels),
@@ -216,6 +219,10 @@ def initial(scene: Scene, key: Array, *, qpos: Array | None = None) -> State:
         m=joined["m"],
         V0=joined["V0"],
     )
+    if scene.settling:
+        gravity = jnp.asarray(scene.gravity, scene.dtype)
+        beds = scene.beds(scene.materials)
+        grains = at_rest(g, beds, grains, scene.mpm_dt, gravity, scene.settling, scene.kernels)
     rigid = None
     if scene.bodies is not None:
         rigid = start(scene.bodies, _first_pose(scene))
@@ -322,6 +329,17 @@ def _substeps(config: SceneConfig, f: Fidelity, grid: Grid, materials: tuple[Mat
         )
     longest = min(f.courant * grid.cell_size / wave if wave else f.rigid_dt, bound.dt, f.rigid_dt)
     return math.ceil(f.rigid_dt / longest - WHOLE)
+
+
+def _settling(
+    config: SceneConfig, grid: Grid, materials: tuple[Material, ...], fills: tuple[tuple[seeding.Fill, ...], ...]
+) -> float | None:
+    """Period (s) of the slowest wave of what starts at rest; None where nothing is to be brought to rest."""
+    gravity = np.asarray(config.gravity)[axes_of(grid.dimension)]
+    if config.start == "unstrained" or not fills or not gravity.any():
+        return None
+    sites = np.concatenate([fill.sites for some in fills for fill in some])
+    return slowest_period(materials, np.ptp(sites, axis=0) + grid.cell_size, gravity)
 
 
 def _first_pose(scene: Scene) -> mujoco.MjData:

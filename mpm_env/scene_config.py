@@ -242,6 +242,7 @@ class SceneConfig(Section):
     speed: Positive | None = None  # m/s, the fastest grain expected; default: free fall through the box
     walls: dict[str, WallConfig] = {}  # side -> wall; sides not named slip
     grains: list[GrainsConfig] = []
+    start: Literal["unstrained", "geostatic"] = "unstrained"  # geostatic: beds start at rest, see mpm_env.mpm.settling
     bodies: BodiesConfig | None = None
     fidelity: str = "standard"  # used where none is asked for
     camera: Camera | None = None

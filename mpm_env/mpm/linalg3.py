@@ -72,3 +72,13 @@ def matrix_rows(e: Array) -> list[list[Array]]:
     if e.shape[0] == 4:
         return [[e[0], e[3]], [e[3], e[1]]]
     return [[e[0], e[5], e[4]], [e[5], e[1], e[3]], [e[4], e[3], e[2]]]
+
+
+def volume_ratio(e: Array) -> Array:
+    """J = sqrt(det b) (n,), the volume of strains e = b - I (s, n) over that at rest."""
+    if e.shape[0] == 4:
+        det = (1 + e[2]) * ((1 + e[0]) * (1 + e[1]) - e[3] * e[3])
+    else:
+        xx, yy, zz, (yz, xz, xy) = 1 + e[0], 1 + e[1], 1 + e[2], e[3:]
+        det = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
+    return jnp.sqrt(jnp.maximum(det, TINY))
