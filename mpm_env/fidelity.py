@@ -25,6 +25,9 @@ class Fidelity(Section):
     stiffness: Annotated[float, Field(gt=0, le=1)] = Field(
         1.0, description="factor on Young's modulus of sand, whose strength does not depend on it: softer is faster"
     )
+    solver: Literal["explicit", "semi_implicit"] = Field(
+        "explicit", description="of the grid; semi_implicit takes any courant, for stiff grains without bodies"
+    )
     precision: Literal["f32", "f64"] = "f32"
     kernels: Literal["auto", "native", "xla"] = Field(
         "auto", description="native C++ where it can be had, or plain XLA: the same to rounding, far apart in speed"

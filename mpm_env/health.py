@@ -12,6 +12,7 @@ MOST_DEPTH = 0.5  # cells a grain may stand inside a body before contact is call
 MOST_TRAVEL = 0.25  # cells a body may move in one rigid step: the points near it are looked up once per rigid step
 MOST_ASTRAY = 0.1  # cells by which a rigid step may end apart from where grains saw the bodies go
 MOST_UNPAID = 1e-3  # share of the exchanged impulse by which what grains got and what bodies got may differ
+MOST_UNSOLVED = 0.1  # share of a substep's forces that the semi-implicit solver may leave over
 
 
 class Health(IntFlag):
@@ -29,6 +30,7 @@ class Health(IntFlag):
     BODY_TOO_FAST = 256
     BODY_ASTRAY = 512
     NOT_PAID = 1024
+    NOT_SOLVED = 2048
 
 
 SENTENCES: dict[Health, str] = {
@@ -43,6 +45,7 @@ SENTENCES: dict[Health, str] = {
     Health.BODY_TOO_FAST: "A body moved over a quarter of a cell in one rigid step: use a smaller fidelity.rigid_dt.",
     Health.BODY_ASTRAY: "MJX moved a body otherwise than its grains saw: raise the model's option iterations.",
     Health.NOT_PAID: "Grains and bodies did not get opposite impulses: contact lost digits, use precision f64.",
+    Health.NOT_SOLVED: "The semi-implicit solver left a part of the forces unsolved: use a smaller courant.",
 }
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -15,15 +14,13 @@ from jax import Array
 
 from coupling.bodies import Bodies, posed, refresh, start
 from coupling.reach import distances_from
-from mpm_env import native
 from mpm_env.config import nearest
 from mpm_env.fidelity import Fidelity
-from mpm_env.health import MOST_TRAVEL, ContactReport
+from mpm_env.health import ContactReport
 from mpm_env.motion import Motion
 from mpm_env.mpm import seeding
 from mpm_env.mpm.materials import Material
-from mpm_env.mpm.settling import at_rest, slowest_period
-from mpm_env.mpm.stability import courant_limit, largest_dt
+from mpm_env.mpm.settling import Settling, at_rest, settling_of
 from mpm_env.mpm.substep import Bed
 from mpm_env.mpm.transfer import CHUNK
 from mpm_env.mpm.types import Grid, Particles, Wall
@@ -31,6 +28,7 @@ from mpm_env.scene_bodies import Sizes, bodies_of, model_of, per_grains, sizes_o
 from mpm_env.scene_cache import keep_programs
 from mpm_env.scene_config import SceneConfig
 from mpm_env.scene_grains import WHOLE, axes_of, fill_of, material_of, whole
+from mpm_env.scene_steps import kernels_of, substeps
 
 SORTED_FROM = 65_536  # grains; with fewer, order saves native kernels a tenth at most, and plain XLA nothing
 OVERLAP = 0.25  # cells that a grain may start inside a body: the jitter of seeding, not a mistake
@@ -54,7 +52,7 @@ class Scene:
     adhesion: tuple[float, ...]  # Pa, of each material to the bodies
     motion: Motion
     sizes: Sizes
-    settling: float | None  # s, period of the bed's slowest wave; None where grains start unstrained
+    settling: Settling | None  # None where grains start unstrained
     middle: float  # m, the slice's y in plane strain
     dtype: Any
     kernels: str  # "native" or "xla"
@@ -153,7 +151,7 @@ def build(config: SceneConfig, fidelity: Fidelity) -> Scene:
         at += chunked
     model = model_of(config.bodies, fidelity, config.gravity) if config.bodies else None
     motion = Motion.of(config.bodies, model)
-    mpm_per_rigid = _substeps(config, fidelity, grid, materials, motion)
+    mpm_per_rigid = substeps(config, fidelity, grid, materials, motion)
     bodies = bodies_of(config, model, grid, fidelity) if model is not None else None
     middle = (config.box.lower[1] + config.box.upper[1]) / 2
     scene = Scene(
@@ -174,7 +172,7 @@ def build(config: SceneConfig, fidelity: Fidelity) -> Scene:
         settling=_settling(config, grid, materials, fills),
         middle=middle,
         dtype=dtype,
-        kernels=native.chosen(fidelity.kernels),
+        kernels=kernels_of(config, fidelity, grid),
     )
     _refuse_overlap(scene)
     return scene
@@ -221,8 +219,7 @@ def initial(scene: Scene, key: Array, *, qpos: Array | None = None) -> State:
     )
     if scene.settling:
         gravity = jnp.asarray(scene.gravity, scene.dtype)
-        beds = scene.beds(scene.materials)
-        grains = at_rest(g, beds, grains, scene.mpm_dt, gravity, scene.settling, scene.kernels)
+        grains = at_rest(g, scene.beds(scene.materials), grains, gravity, scene.settling, scene.kernels)
     rigid = None
     if scene.bodies is not None:
         rigid = start(scene.bodies, _first_pose(scene))
@@ -294,52 +291,15 @@ def _keyframe(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     return model.key(name).qpos, model.key(name).qvel
 
 
-def _substeps(config: SceneConfig, f: Fidelity, grid: Grid, materials: tuple[Material, ...], motion: Motion) -> int:
-    """How many substeps make a rigid step; refuses a substep longer than the stable one."""
-    fall = math.sqrt(2 * float(np.linalg.norm(config.gravity)) * (config.box.upper[2] - config.box.lower[2]))
-    thrown = max((float(np.linalg.norm(s.velocity)) for g in config.grains for s in g.fill), default=0.0)
-    tool = motion.top_speed()
-    speed = max(config.speed or fall, thrown, tool)
-    bound = largest_dt(materials, grid.cell_size, grid.dimension, speed)
-    if tool * f.rigid_dt > MOST_TRAVEL * grid.cell_size:
-        raise ValueError(
-            f"rigid_dt = {f.rigid_dt:.4g} s lets a tool of {tool:.3g} m/s move"
-            f" {tool * f.rigid_dt / grid.cell_size:.2g} cells in one rigid step:"
-            f" use <= {MOST_TRAVEL * grid.cell_size / tool:.3g} s or a slower tool."
-        )
-    wave = max((float(m.wave_speed()) for m in materials), default=0.0)
-    if f.mpm_dt is not None:
-        if f.mpm_dt > bound.dt * (1 + WHOLE):
-            raise ValueError(
-                f"mpm_dt = {f.mpm_dt:.4g} s exceeds the stable {bound.dt:.4g} s set by {bound.reason} at cell_size"
-                f" {grid.cell_size:.4g} m: use a smaller mpm_dt or fewer cells."
-            )
-        n = whole(f.rigid_dt / f.mpm_dt)
-        if n is None:
-            raise ValueError(
-                f"rigid_dt = {f.rigid_dt:.6g} s is {f.rigid_dt / f.mpm_dt:.4g} substeps of mpm_dt = {f.mpm_dt:.6g} s:"
-                f" make it a whole number, with mpm_dt = {f.rigid_dt / math.ceil(f.rigid_dt / f.mpm_dt):.6g}."
-            )
-        return n
-    limit = min((courant_limit(float(m.nu), grid.dimension) for m in materials), default=f.courant)
-    if f.courant > limit:
-        raise ValueError(
-            f"courant = {f.courant:.3g} exceeds the stable {limit:.3g} for the Poisson ratios of this scene in"
-            f" {grid.dimension}-D: use <= {limit:.3g}."
-        )
-    longest = min(f.courant * grid.cell_size / wave if wave else f.rigid_dt, bound.dt, f.rigid_dt)
-    return math.ceil(f.rigid_dt / longest - WHOLE)
-
-
 def _settling(
     config: SceneConfig, grid: Grid, materials: tuple[Material, ...], fills: tuple[tuple[seeding.Fill, ...], ...]
-) -> float | None:
-    """Period (s) of the slowest wave of what starts at rest; None where nothing is to be brought to rest."""
+) -> Settling | None:
+    """How grains that start at rest come to it; None where none are to."""
     gravity = np.asarray(config.gravity)[axes_of(grid.dimension)]
     if config.start == "unstrained" or not fills or not gravity.any():
         return None
     sites = np.concatenate([fill.sites for some in fills for fill in some])
-    return slowest_period(materials, np.ptp(sites, axis=0) + grid.cell_size, gravity)
+    return settling_of(materials, np.ptp(sites, axis=0) + grid.cell_size, gravity, grid.cell_size)
 
 
 def _first_pose(scene: Scene) -> mujoco.MjData:

@@ -15,7 +15,8 @@ import numpy as np
 from jax import Array, lax
 
 from coupling import bodies as rigid
-from mpm_env.health import Health, as_bits
+from mpm_env.health import MOST_UNSOLVED, Health, as_bits
+from mpm_env.mpm import implicit
 from mpm_env.mpm.budgets import mass_that_left
 from mpm_env.mpm.sorting import in_order
 from mpm_env.mpm.stability import MOST_CELLS_PER_SUBSTEP
@@ -61,8 +62,9 @@ def rigid_step(scene: Scene, state: State, drive: Drive) -> State:
         grains, order = in_order(scene.grid, state.grains, scene.spans, state.order)
         state = replace(state, grains=grains, order=order)
     if scene.bodies is None:
-        grains = _run_grains(scene, state)
-        return _examined(scene, state, replace(state, grains=grains, steps=state.steps + 1), Health.WELL)
+        grains, unsolved = _run_grains(scene, state)
+        bits = as_bits({Health.NOT_SOLVED: unsolved > MOST_UNSOLVED}) if unsolved is not None else Health.WELL
+        return _examined(scene, state, replace(state, grains=grains, steps=state.steps + 1), bits)
     b = scene.bodies
     d = state.rigid.replace(ctrl=drive.control)
     twist = rigid.drift(b, d, drive.position, drive.quaternion)
@@ -88,20 +90,23 @@ def rigid_step(scene: Scene, state: State, drive: Drive) -> State:
     return _examined(scene, state, after, contact.examined(touch, report))
 
 
-def _run_grains(scene: Scene, state: State, contact: Contact | None = None, touch: Any = None) -> Any:
-    """The substeps of one rigid step: the grains, and with a contact also what it noted."""
+def _run_grains(scene: Scene, state: State, contact: Contact | None = None, touch: Any = None) -> tuple[Particles, Any]:
+    """The substeps of one rigid step: the grains, with what a contact noted, or the largest share left unsolved."""
     beds = scene.beds(state.materials)
     gravity = jnp.asarray(scene.gravity, scene.dtype)
     if not scene.slots:
-        if contact is None:
-            return state.grains
-        return state.grains, lax.fori_loop(0, scene.mpm_per_rigid, lambda _, t: contact.coast(t), touch)
+        if contact is not None:
+            touch = lax.fori_loop(0, scene.mpm_per_rigid, lambda _, t: contact.coast(t), touch)
+        return state.grains, touch
 
     def one(_: int, both: tuple[Particles, Any]) -> tuple[Particles, Any]:
+        if scene.fidelity.solver == "semi_implicit":
+            return implicit.substep(scene.grid, beds, both[0], scene.mpm_dt, gravity, both[1])
         return substep(scene.grid, beds, both[0], scene.mpm_dt, gravity, contact, both[1], scene.kernels)
 
-    grains, touch = lax.fori_loop(0, scene.mpm_per_rigid, one, (state.grains, touch))
-    return grains if contact is None else (grains, touch)
+    if scene.fidelity.solver == "semi_implicit":
+        touch = jnp.zeros((), scene.dtype)
+    return lax.fori_loop(0, scene.mpm_per_rigid, one, (state.grains, touch))
 
 
 def _examined(scene: Scene, before: State, after: State, contact: Array | int) -> State:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,6 +19,7 @@ from jax import Array, lax
 from mpm_env.mpm.linalg3 import volume_ratio
 from mpm_env.mpm.materials import Material
 from mpm_env.mpm.materials.protocol import p_wave_speed
+from mpm_env.mpm.stability import largest_dt
 from mpm_env.mpm.substep import Bed, substep
 from mpm_env.mpm.types import Grid, Particles
 
@@ -28,11 +30,18 @@ MOST_LOAD = 0.5  # of the modulus: squeezed to 0.7, waves are 1.2 times as fast,
 ALONG = 1e-3  # share of gravity along an axis from which it counts as loading the bed along that axis
 
 
-def slowest_period(materials: tuple[Material, ...], extent: np.ndarray, gravity: np.ndarray) -> float:
-    """Period (s) of the slowest compression wave that gravity (d,) m/s^2 excites in a bed of this extent (d,) m.
+class Settling(NamedTuple):
+    """How long a bed takes to come to rest, static."""
 
-    A quarter of the wave fits the bed, which is held at one end: 4 H / c. Of several materials the softest may lie
-    under the densest; none has hardened yet. Raises ValueError for beds that are too soft for their weight.
+    period: float  # s, of the slowest compression wave that gravity excites
+    dt: float  # s, of an explicit substep
+
+
+def settling_of(materials: tuple[Material, ...], extent: np.ndarray, gravity: np.ndarray, cell_size: float) -> Settling:
+    """For grains that fill this extent (d,) m, in gravity (d,) m/s^2.
+
+    A quarter of the slowest wave fits a bed, which is held at one end: its period is 4 H / c. Of several materials the
+    softest may lie under the densest; none has hardened yet. Raises ValueError for beds too soft for their weight.
     """
     loaded = np.abs(gravity) > ALONG * np.linalg.norm(gravity)
     length = float(np.max(extent, where=loaded, initial=0.0))
@@ -45,25 +54,25 @@ def slowest_period(materials: tuple[Material, ...], extent: np.ndarray, gravity:
             f" {modulus:.4g} Pa: beyond {MOST_LOAD} they are squeezed until the time step is too long. Use a stiffer"
             " material, less depth or start = unstrained."
         )
-    return 4 * length / speed
+    return Settling(4 * length / speed, largest_dt(materials, cell_size, len(extent), 0.0).dt)
 
 
 def at_rest(
     grid: Grid,
     beds: tuple[Bed, ...],
     p: Particles,
-    dt: float,
     gravity: Array,
-    period: float,
+    settling: Settling,
     kernels: str = "auto",
 ) -> Particles:
     """The grains with the strains that bear gravity (d,) m/s^2; positions, velocities and masses stay.
 
-    Dynamic relaxation: substeps that move no grain, with critical damping of the slowest wave (period in s). The
+    Dynamic relaxation: substeps that move no grain, with critical damping of the slowest wave. The
     volume that a grain comes with is that in the bed, so that a bed stays where it was filled in and its density is
     the material's rho there; V0 becomes the volume that it would spring back to.
     Grains that move at the start are left as they are, and weigh on nothing.
     """
+    period, dt = settling
     keep = math.exp(-4 * math.pi * dt / period)
     moves = jnp.any(p.v != 0, axis=0)
 

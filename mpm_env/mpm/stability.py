@@ -46,4 +46,4 @@ def largest_dt(materials: tuple[Material, ...], cell_size: float, dimension: int
         bounds.append(
             DtBound(MOST_CELLS_PER_SUBSTEP * cell_size / speed, f"the speed {speed:.3g} m/s of grains and tools")
         )
-    return min(bounds)
+    return min(bounds, default=DtBound(math.inf, "nothing"))

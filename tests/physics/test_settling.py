@@ -18,7 +18,7 @@ from mpm_env.fidelity import Fidelity
 from mpm_env.mpm.linalg3 import volume_ratio
 from mpm_env.mpm.materials import MATERIALS, Material, MuI, Sand
 from mpm_env.mpm.materials.protocol import lame
-from mpm_env.mpm.settling import at_rest, slowest_period
+from mpm_env.mpm.settling import Settling, at_rest, settling_of
 from mpm_env.mpm.substep import Bed
 from mpm_env.mpm.types import MARGIN, Grid, Particles, Wall
 from mpm_env.scene_config import SceneConfig, resolve
@@ -52,13 +52,13 @@ def bed(name: str, cells: int, d: int, **changes: float | str) -> tuple[Grid, Ma
 def rested(grid: Grid, material: Material, p: Particles, gravity: tuple[float, ...] | None = None) -> Particles:
     d = grid.dimension
     gravity = gravity or down(d)
-    period = slowest_period((material,), np.full(d, HEIGHT), np.asarray(gravity))
-    return settle(grid, longest_step(grid, material), period, material, p, jnp.asarray(gravity, p.x.dtype))
+    settling = settling_of((material,), np.full(d, HEIGHT), np.asarray(gravity), grid.cell_size)
+    return settle(grid, settling, material, p, jnp.asarray(gravity, p.x.dtype))
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2))
-def settle(grid: Grid, dt: float, period: float, material: Material, p: Particles, gravity: Array) -> Particles:
-    return at_rest(grid, (Bed(material, 0, p.count),), p, dt, gravity, period)
+@partial(jax.jit, static_argnums=(0, 1))
+def settle(grid: Grid, settling: Settling, material: Material, p: Particles, gravity: Array) -> Particles:
+    return at_rest(grid, (Bed(material, 0, p.count),), p, gravity, settling)
 
 
 def speeds(grid: Grid, material: Material, p: Particles, gravity: tuple[float, ...] | None = None) -> list[float]:
