@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from jax import Array, lax
 
+from benchmarks.validation.blocks import alive, balance, block, box, example, go, lattice
 from mpm_env import Scene, State, build, initial
 from mpm_env.fidelity import Fidelity
 from mpm_env.health import MOST_UNSOLVED
@@ -18,7 +19,6 @@ from mpm_env.mpm.substep import Bed
 from mpm_env.mpm.types import Grid, Particles
 from mpm_env.scene_config import read_scene
 from mpm_env.sim import advance, scripted
-from tests.physics.blocks import alive, balance, block, box, example, go, lattice
 
 CELL = 1 / 8  # m
 GRID = box((12, 8), CELL)

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from jax import Array
 
+from benchmarks.validation.blocks import GRAVITY, alive, block, box, example, go, lattice, longest_step
 from mpm_env import build, initial
 from mpm_env.config import parse
 from mpm_env.fidelity import Fidelity
@@ -23,7 +24,6 @@ from mpm_env.mpm.substep import Bed
 from mpm_env.mpm.types import MARGIN, Grid, Particles, Wall
 from mpm_env.scene_config import SceneConfig, resolve
 from mpm_env.sim import advance, scripted
-from tests.physics.blocks import GRAVITY, alive, block, box, example, go, lattice, longest_step
 
 HEIGHT = 0.2  # m
 ACROSS = {2: 6, 3: 4}  # cells of the bed along each level axis
