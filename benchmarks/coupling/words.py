@@ -67,9 +67,9 @@ and goes, and a block of sand there creeps. Rigid contacts are as hard as their 
 that of its thickest part: a thin wall on a thick mesh is not refused. Where grains of two densities meet a body, gaps
 are told as for the lighter ones, so the heavier touch early.
 
-Sand that a tool stirs for long becomes denser: grains that entered the tool are put back to its surface between others,
-and no strain tells of it. A small bed lost 2 % of its volume with each sweep to and fro (`docs/validation.md`), and 0.3 %
-where the grid alone stops grains (`push_out: false`), which thick tools allow.
+Sand that a tool stirs for long becomes denser: grains that entered the tool are put back to its surface between
+others, and no strain tells of it. A small bed lost 2 % of its volume with each sweep to and fro
+(`docs/validation.md`), and 0.3 % where the grid alone stops grains (`push_out: false`), which thick tools allow.
 """
 
 SCENES = {
