@@ -63,7 +63,7 @@ def rigid_step(scene: Scene, state: State, drive: Drive) -> State:
         state = replace(state, grains=grains, order=order)
     if scene.bodies is None:
         grains, unsolved = _run_grains(scene, state)
-        bits = as_bits({Health.NOT_SOLVED: unsolved > MOST_UNSOLVED}) if unsolved is not None else Health.WELL
+        bits = as_bits({Health.NOT_SOLVED: ~(unsolved <= MOST_UNSOLVED)}) if unsolved is not None else Health.WELL
         return _examined(scene, state, replace(state, grains=grains, steps=state.steps + 1), bits)
     b = scene.bodies
     d = state.rigid.replace(ctrl=drive.control)

@@ -1,10 +1,11 @@
 """A substep with the forces of its end: its length is bounded by how far grains go, not by the speed of sound.
 
-Backward Euler on the grid (S13 section 6, J16 section 11): the nodes' velocities u solve M (u - v) = dt f(u), where v
-are those that grains and gravity bring and f are the forces once grains were strained by dt grad u and their materials
-answered, return mapping included, as K16 has it: else sand would hold together for the length of a step. Newton with
-exact slopes that are never stored, each solved as far as it is worth by BiCGSTAB, since plastic flow has unsymmetric
-slopes; a step that does not help is halved. Waves that a step does not resolve are damped.
+Backward Euler on the grid, by Newton and a Krylov method without matrices (Sulsky & Kaul, Implicit dynamics in the
+material-point method, CMAME 193, 2004; S13 and J16 solve once, linearly): the nodes' velocities u have M (u - v) =
+dt f(u), where v are those that grains and gravity bring and f are the forces once grains were strained by dt grad u and
+their materials answered, return mapping included: with elastic forces alone sand would hold together for the length of
+a step. BiCGSTAB, since plastic flow has unsymmetric slopes; a step of Newton's that does not help is halved. Waves that
+a substep does not resolve are damped.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ def substep(
 ) -> tuple[Particles, Array]:
     """Advance the grains by dt; gravity (d,) m/s^2. Returns the grains, and the larger of `worst` and what is unsolved.
 
-    Momentum is conserved whatever is left unsolved: all that Krylov methods add has no sum, as internal forces have.
+    Momentum is conserved whatever is left unsolved: what the search adds has no sum, as internal forces have none.
     """
     unstressed = replace(p, tau=jnp.zeros_like(p.tau))
     nodes = p2g(grid, unstressed, dt, chunk_of(p))
