@@ -94,6 +94,7 @@ def test_explicit_solver_is_lost_there() -> None:
     assert not last < 100 * first
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CHECKED)
 def test_momentum_is_conserved_and_steps_are_solved(name: str) -> None:
     material, p = bar(name, mode=HARD)
@@ -136,6 +137,7 @@ def middle(state: State) -> np.ndarray:
     return np.average(np.asarray(state.grains.x, float), weights=np.asarray(state.grains.m), axis=1)
 
 
+@pytest.mark.slow
 def test_stiff_column_falls_nearer_to_a_fine_one_than_with_explicit_steps() -> None:
     """At 40 times the explicit step: each transfer dissipates, and there are as many fewer of them."""
     scene, state = collapsed(2, solver="semi_implicit", courant=20.0)
@@ -149,6 +151,7 @@ def test_stiff_column_falls_nearer_to_a_fine_one_than_with_explicit_steps() -> N
     assert np.linalg.norm(ours - right) < 0.7 * np.linalg.norm(theirs - right), (ours, theirs, right)
 
 
+@pytest.mark.slow
 def test_what_is_left_unsolved_gets_its_health_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(implicit, "TRIES", 1)
     _, state = collapsed(2, solver="semi_implicit", courant=20.0)
