@@ -89,9 +89,10 @@ def page(rows: list[dict[str, Any]], about: dict[str, Any]) -> str:
         "# Explicit or semi-implicit",
         "",
         "Made by `python -m benchmarks.solver`; not written by hand. A column of sand, 16 cells high, collapses in"
-        " plane strain (288 grains). Cost is CPU seconds per simulated second, the median of five with the least and"
+        " plane strain (512 grains). Cost is CPU seconds per simulated second, the median of five with the least and"
         " the most; the error that of the final profile (area between it and that of explicit steps at 64 cells, over"
-        " the area of the sand). The Courant number is the one reached: grains may cross half a cell in a substep.",
+        " the area of the sand). The Courant number is the one reached: grains may cross half a cell in a substep."
+        " Sand's strength does not depend on its modulus: where softer sand will do, explicit steps are cheapest.",
         "",
         f"{about['cpu']}, {about['cores']} cores; {about['versions']}; commit {about['commit']}, {about['date']}.",
     ]
